@@ -48,7 +48,7 @@ def estimate_force(
     cover few markers and are the least certain. Both are in px (`MarkerTracker`); `pixel_pitch` is
     m per px.
     """
-    contact = np.where(depth > _CONTACT_SHARE * max(float(depth.max()), 0.0), depth, 0)
+    contact = _contact_depth(depth)
     normal = sensor.foundation_modulus * float(contact.sum()) * pixel_pitch**2
     if markers is None or displacement is None:
         return TouchForce(normal, None)
@@ -58,6 +58,26 @@ def estimate_force(
     moved = weight @ displacement.reshape(-1, 2) / max(float(weight.sum()), 1e-12)
     x, y = sensor.shear_stiffness * pixel_pitch * moved
     return TouchForce(normal, (float(x), float(y)))
+
+
+def contact_centre(depth: Map, pixel_pitch: float) -> tuple[float, float]:
+    """Return the centre of a contact, weighted by depth: x and y from the image's middle, m.
+
+    (0, 0) without contact; `pixel_pitch` is m per px.
+    """
+    contact = _contact_depth(depth).astype(np.float64)
+    total = contact.sum()
+    if total <= 0:
+        return 0.0, 0.0
+    h, w = depth.shape
+    x = contact.sum(0) @ (np.arange(w) - (w - 1) / 2) / total
+    y = contact.sum(1) @ (np.arange(h) - (h - 1) / 2) / total
+    return float(pixel_pitch * x), float(pixel_pitch * y)
+
+
+def _contact_depth(depth: Map) -> Map:
+    """Return the depth where the object touches, 0 where the gel only bulges beside it."""
+    return np.where(depth > _CONTACT_SHARE * max(float(depth.max()), 0.0), depth, 0)
 
 
 @dataclass(frozen=True, eq=False)

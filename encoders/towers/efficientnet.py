@@ -26,6 +26,9 @@ STAGES = (  # kernel, stride of the first block, expansion, output channels, rep
     (5, 2, 6, 192, 4),
     (3, 1, 6, 320, 1),
 )
+MAP_BLOCK = 10
+"""Last block at stride 16, whose features still say where in the image something is."""
+MAP_CHANNELS = 112
 _BATCH_NORM_EPS = 1e-3  # TensorFlow's default, under which the weights were trained
 
 
@@ -96,6 +99,14 @@ class EfficientNetLite0(nn.Module):
     def features(self, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 1280"]:
         """Return the mean of the last feature map; any image of at least 32 pixels a side."""
         return self.head(self.blocks(self.stem(x))).mean((2, 3))
+
+    def map(self, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 112 y x"]:
+        """Return the feature map at stride 16; `finish` makes the pooled features of it."""
+        return self.blocks[: MAP_BLOCK + 1](self.stem(x))
+
+    def finish(self, features: Float[Tensor, "n 112 y x"]) -> Float[Tensor, "n 1280"]:
+        """Return the pooled features of a map at stride 16."""
+        return self.head(self.blocks[MAP_BLOCK + 1 :](features)).mean((2, 3))
 
     def forward(self, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 1000"]:
         """Return ImageNet logits."""

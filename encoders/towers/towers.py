@@ -6,11 +6,11 @@ import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float16, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -24,6 +24,7 @@ _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # OpenAI CLIP's, of every CLIPModel checkpoint
 _CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 _CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+T = TypeVar("T")
 _HASH_SUFFIX = re.compile(r"#[0-9a-f]{12}$")
 
 
@@ -42,6 +43,17 @@ class Towers(Protocol):
 
     def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
         """Return one embedding for each sentence, on the CPU, not normalised."""
+        ...
+
+
+@runtime_checkable
+class MapTowers(Towers, Protocol):
+    """Towers that also say where in an image something is."""
+
+    def embed_with_maps(
+        self, images: UInt8[np.ndarray, "n h w 3"]
+    ) -> tuple[Float[Tensor, "n d"], Float16[np.ndarray, "n c y x"]]:
+        """Return embeddings as `embed_images`, and feature maps at stride 16, by one pass."""
         ...
 
 
@@ -95,24 +107,40 @@ class OfflineTowers:
         """Return the sentence encoder."""
         return minilm.SentenceEncoder(self.device)
 
-    @torch.no_grad()
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
         """Return pooled ImageNet features."""
         network = self.image_tower  # loaded here, not by two threads at once
+        batches = self._in_batches(lambda pixels: network.features(pixels).cpu(), images)
+        return _joined(batches, self.image_dim)
 
+    def embed_with_maps(
+        self, images: UInt8[np.ndarray, "n h w 3"]
+    ) -> tuple[Float[Tensor, "n d"], Float16[np.ndarray, "n c y x"]]:
+        """Return pooled ImageNet features, and maps of 112 channels at stride 16."""
+        network = self.image_tower
+
+        def embed(pixels: Tensor) -> tuple[Tensor, Tensor]:
+            features = network.map(pixels)
+            return network.finish(features).cpu(), features.half().cpu()
+
+        batches = self._in_batches(embed, images)
+        maps = np.concatenate([features.numpy() for _, features in batches])
+        return _joined([pooled for pooled, _ in batches], self.image_dim), maps
+
+    def _in_batches(self, embed: Callable[[Tensor], T], images: np.ndarray) -> list[T]:
         @torch.no_grad()  # of the thread it runs in
-        def embed(batch: np.ndarray) -> Tensor:
-            pixels = imagenet_pixels(batch).to(self.device, memory_format=torch.channels_last)
-            return network.features(pixels).cpu()
+        def run(batch: np.ndarray) -> T:
+            pixels = imagenet_pixels(batch)
+            return embed(pixels.to(self.device, memory_format=torch.channels_last))
 
         if self.device == "cpu":
-            return _on_all_cores(embed, images, self.image_dim, _CPU_PICTURES)
-        return _in_batches(embed, images, self.image_dim, BATCH)
+            return _on_all_cores(run, images, _CPU_PICTURES)
+        return _in_batches(run, images)
 
     @torch.no_grad()
     def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
         """Return the mean of the last hidden states, as sentence-transformers does."""
-        return _in_batches(lambda batch: self.text_tower(batch).cpu(), texts, self.text_dim)
+        return _joined(_in_batches(lambda batch: self.text_tower(batch).cpu(), texts), self.text_dim)
 
 
 class ClipTowers:
@@ -142,7 +170,7 @@ class ClipTowers:
             # transformers 5: the projected vector is the output's pooler_output
             return self._model.get_image_features(pixel_values=pixels).pooler_output.cpu()
 
-        return _in_batches(embed, images, self.image_dim)
+        return _joined(_in_batches(embed, images), self.image_dim)
 
     @torch.no_grad()
     def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
@@ -156,7 +184,7 @@ class ClipTowers:
                 input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
             ).pooler_output.cpu()
 
-        return _in_batches(embed, texts, self.text_dim)
+        return _joined(_in_batches(embed, texts), self.text_dim)
 
 
 def imagenet_pixels(images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n 3 y x"]:
@@ -189,25 +217,24 @@ def _normalised(pixels: Tensor, mean: tuple[float, ...], std: tuple[float, ...])
     return (pixels - torch.tensor(mean)[:, None, None]) / torch.tensor(std)[:, None, None]
 
 
-def _on_all_cores(
-    embed: Callable[[np.ndarray], Tensor], images: np.ndarray, width: int, size: int
-) -> Tensor:
+def _on_all_cores(embed: Callable[[np.ndarray], T], images: np.ndarray, size: int) -> list[T]:
     """Embed batches each on one core: torch's threads would wait for the slowest at each layer."""
     threads = torch.get_num_threads()
     if threads == 1 or len(images) <= size:
-        return _in_batches(embed, images, width, size)
+        return _in_batches(embed, images, size)
     batches = [images[i : i + size] for i in range(0, len(images), size)]
     try:
         with ThreadPoolExecutor(threads, initializer=lambda: torch.set_num_threads(1)) as pool:
-            return torch.cat(list(pool.map(embed, batches)))
+            return list(pool.map(embed, batches))
     finally:
         torch.set_num_threads(threads)  # for threads yet to come; this one's was never changed
 
 
-def _in_batches(
-    embed: Callable[[Any], Tensor], items: Any, width: int, size: int = BATCH
-) -> Tensor:
-    batches = [embed(items[i : i + size]) for i in range(0, len(items), size)]
+def _in_batches(embed: Callable[[Any], T], items: Any, size: int = BATCH) -> list[T]:
+    return [embed(items[i : i + size]) for i in range(0, len(items), size)]
+
+
+def _joined(batches: list[Tensor], width: int) -> Tensor:
     return torch.cat(batches) if batches else torch.empty(0, width)
 
 

@@ -1,17 +1,36 @@
 """Embedded trajectories and goals: everything that a distance is computed from."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float16, Float32
 
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
+from touchgoal.rewards.features.contact_reading import ContactReadings
 from touchgoal.rewards.goals import Modality
 
-TIME_AXIS = {"image": 0, "touch": 1}
-"""Fields of `EmbeddedEpisode` with a value a frame -> the axis that counts the frames."""
+Rows = slice | np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFeatures:
+    """Features of one camera's images, by one pass of the image tower."""
+
+    pooled: Float32[np.ndarray, "n d"]  # unit vectors
+    map: Float16[np.ndarray, "n c y x"] | None = None  # at stride 16; None from other towers
+
+    def take(self, rows: Rows) -> "CameraFeatures":
+        """Return the features of some frames."""
+        return CameraFeatures(self.pooled[rows], None if self.map is None else self.map[rows])
+
+    @staticmethod
+    def join(pieces: "Sequence[CameraFeatures]") -> "CameraFeatures":
+        """Return consecutive features of one camera as one."""
+        maps = [p.map for p in pieces if p.map is not None]
+        pooled = np.concatenate([p.pooled for p in pieces])
+        return CameraFeatures(pooled, np.concatenate(maps) if maps else None)
 
 
 @dataclass(frozen=True)
@@ -31,6 +50,9 @@ class EmbeddedEpisode:
     object: str = ""  # catalogue id of the object, "" if unknown
     success: bool | None = None  # whether the episode reached its goal, None if unknown
     words: bool = True  # whether its touch embeddings can be compared with sentences
+    # features of the parts of a cost, by key of the camera; empty and None if not requested
+    cameras: Mapping[str, CameraFeatures] = field(default_factory=dict)
+    readings: ContactReadings | None = None  # contact of the fingertips `sides`
 
     def __len__(self) -> int:
         return self.touches().shape[1] if self.image is None else len(self.image)
@@ -42,20 +64,6 @@ class EmbeddedEpisode:
         touch: tuple[Modality, ...] = () if self.touch is None else ("tactile",)
         return (*image, *touch, "text") if touch and self.words else (*image, *touch)
 
-    @classmethod
-    def joined(cls, pieces: "Sequence[EmbeddedEpisode]", repeated: int) -> "EmbeddedEpisode":
-        """Return consecutive pieces of one trajectory as one.
-
-        The first `repeated` frames of every piece but the first were embedded for context only.
-        """
-        joined = {}
-        for name, axis in TIME_AXIS.items():
-            arrays = [getattr(piece, name) for piece in pieces]
-            if arrays[0] is not None:
-                later = [np.delete(a, np.s_[:repeated], axis) for a in arrays[1:]]
-                joined[name] = np.concatenate([arrays[0], *later], axis)
-        return replace(pieces[0], **joined)
-
     def pictures(self) -> Float32[np.ndarray, "n d"]:
         """Return the image embeddings of a trajectory that has the modality image."""
         assert self.image is not None, f"{self.source} has no pictures"
@@ -66,13 +74,48 @@ class EmbeddedEpisode:
         assert self.touch is not None, f"{self.source} has no touch"
         return self.touch
 
+    def take(self, rows: Rows) -> "EmbeddedEpisode":
+        """Return the trajectory with some of its frames; its first contact stays as it was."""
+        return replace(
+            self,
+            image=None if self.image is None else self.image[rows],
+            touch=None if self.touch is None else self.touch[:, rows],
+            cameras={key: camera.take(rows) for key, camera in self.cameras.items()},
+            readings=None if self.readings is None else self.readings.take(rows),
+        )
+
+    @classmethod
+    def joined(cls, pieces: "Sequence[EmbeddedEpisode]", repeated: int) -> "EmbeddedEpisode":
+        """Return consecutive pieces of one trajectory as one.
+
+        The first `repeated` frames of every piece but the first were embedded for context only.
+        """
+        return pieces[0].extended([piece.take(slice(repeated, None)) for piece in pieces[1:]])
+
+    def extended(self, later: "Sequence[EmbeddedEpisode]") -> "EmbeddedEpisode":
+        """Return this trajectory with consecutive later pieces of itself behind it."""
+        pieces = (self, *later)
+        readings = [p.readings for p in pieces if p.readings is not None]
+        return replace(
+            self,
+            image=None if self.image is None else np.concatenate([p.pictures() for p in pieces]),
+            touch=None if self.touch is None else np.concatenate([p.touches() for p in pieces], 1),
+            cameras={k: CameraFeatures.join([p.cameras[k] for p in pieces]) for k in self.cameras},
+            readings=ContactReadings.join(readings) if readings else None,
+        )
+
 
 @dataclass(frozen=True)
 class EmbeddedGoal:
-    """A goal as unit embeddings, one per modality that has a goal."""
+    """Goals of a trajectory as features, one or several (g) for each modality that has any.
+
+    Of several the nearest counts, softly (`soft_minimum`).
+    """
 
     forms: Mapping[str, str]  # the goals as a user writes them, by modality
     same_episode: frozenset[str]  # modalities whose goal is the trajectory's own frame
-    image: Float32[np.ndarray, " d"] | None = None
-    touch: Float32[np.ndarray, "sides k"] | None = None
-    text: Float32[np.ndarray, " k"] | None = None
+    image: Float32[np.ndarray, "g d"] | None = None
+    touch: Float32[np.ndarray, "sides g k"] | None = None
+    text: Float32[np.ndarray, "g k"] | None = None
+    cameras: Mapping[str, CameraFeatures] = field(default_factory=dict)
+    readings: ContactReadings | None = None

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,17 +14,19 @@ from touchgoal.control.tactile.picture_guard import check_untouched
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.pretrained import AnyTouchEncoder
-from touchgoal.encoders.towers.towers import Towers
+from touchgoal.encoders.towers.towers import MapTowers, Towers
 from touchgoal.episodes.schema import Episode, is_camera
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Contact, first_contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.features.embedded import CameraFeatures, EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.features.feature_stream import FeatureStream, Frames
 from touchgoal.rewards.goals import (
     EpisodeEnd,
     Goal,
     GoalPicture,
     GoalSpec,
+    OwnFrame,
     PictureGoal,
     Sentence,
     TouchArrays,
@@ -38,11 +41,16 @@ class EpisodeEmbedder:
     """Embeds trajectories and goals with frozen encoders.
 
     The background of each fingertip is the median of the episode's first 5 frames, which must be
-    free of contact.
+    free of contact. With `with_parts` it embeds everything that the parts of a cost need: both
+    cameras, their maps, and the contact of the fingertips; without, one camera and touch.
     """
 
     def __init__(
-        self, towers: Towers, encoder: AnyTouchEncoder | None, camera: str = FRONT
+        self,
+        towers: Towers,
+        encoder: AnyTouchEncoder | None,
+        camera: str = FRONT,
+        with_parts: bool = True,
     ) -> None:
         """Take the encoders.
 
@@ -52,12 +60,14 @@ class EpisodeEmbedder:
             encoder: touch encoder (put into evaluation mode), which takes sentences if it was aligned
                 with these towers; None to measure images alone.
             camera: key of the camera whose images are measured; "" for a plain video's.
+            with_parts: whether to embed the parts of a cost, too.
         """
         self._towers = towers
         self.encoder = encoder
         self._aligned = encoder if encoder is not None and encoder.towers else None
         self.knows_words = self._aligned is not None  # touch can be compared with sentences
-        self._camera = camera
+        self.camera = camera
+        self.with_parts = with_parts
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
         self._pictures_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
         self.made_with = self._pictures_with  # of episodes with touch, if there is an encoder
@@ -84,38 +94,63 @@ class EpisodeEmbedder:
         descriptions: bool = False,
         contact: Contact | None = None,
     ) -> EmbeddedEpisode:
-        """Embed an episode's camera and fingertips; on request the sentences about it, too.
+        """Embed an episode's cameras and fingertips; on request the sentences about it, too.
 
         The first contact is looked for unless it is given. UserError: the episode lacks the camera,
         starts in contact, or has descriptions that are no list of sentences.
         """
-        sides = tuple(k for k in TACTILE if k in episode.frames) if self.encoder else ()
+        truth = episode.frames.get(TRUTH_CONTACT)
+        if self._sides(episode.frames) and truth is not None and truth[:START_FRAMES].any():
+            raise UserError(
+                f"{source} starts in contact, so its fingertips have no background; record it "
+                f"with {START_FRAMES} frames before the first touch"
+            )
         success = episode.meta.get("success")
-        return EmbeddedEpisode(
-            source=source,
-            fps=fps,
+        stream = self.stream(episode.frames, fps, source)
+        return replace(
+            stream.embed(episode.frames),
             contact=contact or first_contact(episode),
-            made_with=self.made_with if sides else self._pictures_with,
-            image=self._episode_pictures(episode, source, touch_alone=bool(sides)),
-            sides=sides,
-            touch=self._episode_touch(episode, sides, source) if sides else None,
             descriptions=self._embed_descriptions(episode, source) if descriptions else None,
             object=str(episode.meta.get("object", "")),
             success=None if success is None else bool(success),
-            words=self.knows_words,
         )
 
     def embed_video(
         self, frames: UInt8[np.ndarray, "n h w 3"], fps: float, source: str
     ) -> EmbeddedEpisode:
         """Embed a plain video or folder of images: images alone, of an unknown camera."""
+        camera = self.embed_camera(frames)
         return EmbeddedEpisode(
             source=source,
             fps=fps,
             contact=Contact(None, "no touch"),
             made_with=replace(self._pictures_with, camera=""),
-            image=self.embed_pictures(frames),
+            image=camera.pooled,
+            cameras={FRONT: camera} if self.with_parts else {},
         )
+
+    def stream(self, first: Frames, fps: float, source: str) -> "FeatureStream":
+        """Return a stream that embeds a trajectory piece by piece, as `embed_episode` in one go.
+
+        `first` holds at least its first frames, which set the background of the fingertips.
+        UserError: no camera to measure, or fingertips that do not look untouched.
+        """
+        sides = self._sides(first)
+        if self.camera not in first:
+            cameras = [key for key in first if is_camera(key)]
+            if cameras or not sides:
+                raise UserError(missing_camera(source, self.camera, cameras))
+        sensor = SENSORS.get(self.made_with.sensor)
+        for side in sides if sensor is not None else ():
+            check_untouched(touch_background(first[side]), sensor, f"{side} of {source}")
+        return FeatureStream(self, first, sides, fps, source)
+
+    def source_of(self, sides: Sequence[str]) -> EmbeddingSource:
+        """Return what embeddings of a trajectory with these fingertips are made with."""
+        return self.made_with if sides else self._pictures_with
+
+    def _sides(self, frames: Frames) -> tuple[str, ...]:
+        return tuple(key for key in TACTILE if key in frames) if self.encoder else ()
 
     def embed_goal(self, goal: Goal, own: EmbeddedEpisode) -> EmbeddedGoal:
         """Embed a goal for one trajectory; frames of `own` are not embedded again.
@@ -123,10 +158,21 @@ class EpisodeEmbedder:
         UserError: a frame beyond the trajectory, an unreadable picture or episode, or an episode
         with other fingertips.
         """
-        image = None if goal.image is None else self._goal_picture(goal.image, own)
-        touch = None if goal.tactile is None else self._goal_touch(goal.tactile, own)
-        text = None if goal.text is None else self.embed_sentences([goal.text.text])[0]
-        return EmbeddedGoal(goal.as_dict(), goal.same_episode, image, touch, text)
+        embedded = EmbeddedGoal(goal.as_dict(), goal.same_episode)
+        if goal.image is not None:
+            embedded = replace(embedded, **self._goal_pictures(goal.image, own))
+        if goal.tactile is not None:
+            embedded = replace(embedded, **self._goal_touches(goal.tactile, own))
+        if goal.text is not None:
+            embedded = replace(embedded, text=self.embed_sentences([goal.text.text]))
+        return embedded
+
+    def embed_camera(self, frames: UInt8[np.ndarray, "n h w 3"]) -> CameraFeatures:
+        """Return features of one camera's images: with a map if parts are wanted."""
+        if not self.with_parts or not isinstance(self._towers, MapTowers):
+            return CameraFeatures(self.embed_pictures(frames))
+        pooled, maps = self._towers.embed_with_maps(frames)
+        return CameraFeatures(_unit(pooled), maps)
 
     def embed_pictures(self, frames: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, "n d"]:
         """Return unit embeddings of camera images."""
@@ -151,53 +197,37 @@ class EpisodeEmbedder:
         assert self._aligned is not None  # without it no modality takes a sentence
         return self._aligned.embed_text_goal(list(sentences), self._towers)
 
-    def _goal_picture(self, spec: PictureGoal, own: EmbeddedEpisode) -> Float32[np.ndarray, " d"]:
+    def _goal_pictures(self, spec: PictureGoal, own: EmbeddedEpisode) -> dict[str, Any]:
+        """Return the fields of an `EmbeddedGoal` that the goal of the pictures sets."""
+        main = self.camera or FRONT
         if isinstance(spec, Sentence):
             assert self._towers.pretrained_together  # or a sentence is no goal for pictures
-            return _unit(self._towers.embed_texts([spec.text]))[0]
+            return {"image": _unit(self._towers.embed_texts([spec.text]))}
         if isinstance(spec, GoalPicture):
-            return self.embed_pictures(spec.read())[0]
+            cameras = {main: self.embed_camera(spec.read())}
+            return {"image": cameras[main].pooled, "cameras": cameras}
         if isinstance(spec, EpisodeEnd):
-            camera = self._camera or FRONT
-            return self.embed_pictures(spec.read([camera]).frames[camera][-1:])[0]
-        return own.pictures()[frame_index(spec, len(own), own.source)]
+            frames = spec.read(tuple(own.cameras) or (main,)).frames
+            cameras = {k: self.embed_camera(v[-1:]) for k, v in frames.items() if is_camera(k)}
+            return {"image": cameras[main].pooled, "cameras": cameras}
+        end = own.take(_one(frame_index(spec, len(own), own.source)))
+        return {"image": end.pictures(), "cameras": end.cameras}
 
-    def _goal_touch(self, spec: TouchGoal, own: EmbeddedEpisode) -> Float32[np.ndarray, "sides k"]:
-        if isinstance(spec, TouchArrays):
-            return np.concatenate(
-                [self.embed_touch(spec.pictures[k][None], spec.backgrounds[k]) for k in own.sides]
-            )
-        if isinstance(spec, EpisodeEnd):
-            return self._episode_touch(spec.read(own.sides), own.sides, str(spec))[:, -1]
-        return own.touches()[:, frame_index(spec, len(own), own.source)]
-
-    def _episode_pictures(
-        self, episode: Episode, source: str, touch_alone: bool
-    ) -> Float32[np.ndarray, "n d"] | None:
-        if self._camera in episode.frames:
-            return self.embed_pictures(episode.frames[self._camera])
-        cameras = [key for key in episode.frames if is_camera(key)]
-        if cameras or not touch_alone:
-            raise UserError(missing_camera(source, self._camera, cameras))
-        return None
-
-    def _episode_touch(
-        self, episode: Episode, sides: Sequence[str], source: str
-    ) -> Float32[np.ndarray, "sides n k"]:
-        truth = episode.frames.get(TRUTH_CONTACT)
-        if truth is not None and truth[:START_FRAMES].any():
-            raise UserError(
-                f"{source} starts in contact, so its fingertips have no background; record it "
-                f"with {START_FRAMES} frames before the first touch"
-            )
-        pictures = [episode.frames[side] for side in sides]
-        backgrounds = [touch_background(p) for p in pictures]
-        if (sensor := SENSORS.get(self.made_with.sensor)) is not None:
-            for side, background in zip(sides, backgrounds, strict=True):
-                check_untouched(background, sensor, f"{side} of {source}")
-        return np.stack(
-            [self.embed_touch(p, b) for p, b in zip(pictures, backgrounds, strict=True)]
-        )
+    def _goal_touches(self, spec: TouchGoal, own: EmbeddedEpisode) -> dict[str, Any]:
+        """Return the fields of an `EmbeddedGoal` that the goal of touch sets."""
+        if isinstance(spec, OwnFrame):
+            end = own.take(_one(frame_index(spec, len(own), own.source)))
+        elif isinstance(spec, EpisodeEnd):
+            read = spec.read(own.sides)
+            end = self.embed_episode(replace(read, meta={}), own.fps, str(spec))
+            end = end.take(_one(len(end) - 1))
+        else:
+            frames = {
+                side: np.stack([*[spec.backgrounds[side]] * START_FRAMES, spec.pictures[side]])
+                for side in own.sides
+            }
+            end = self.stream(frames, own.fps, str(spec)).embed(frames).take(_one(START_FRAMES))
+        return {"touch": end.touch, "readings": end.readings}
 
     def _embed_descriptions(
         self, episode: Episode, source: str
@@ -216,6 +246,10 @@ def check_words(specs: Iterable[GoalSpec], encoder: AnyTouchEncoder | None) -> N
             f"goal '{sentences[0]}': this touch encoder was not aligned with texts: leave the goal "
             "out, or take an encoder of train-encoder align"
         )
+
+
+def _one(row: int) -> slice:
+    return slice(row, row + 1)
 
 
 def missing_camera(source: str, camera: str, cameras: Sequence[str]) -> str:

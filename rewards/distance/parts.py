@@ -1,0 +1,169 @@
+"""Named parts of a cost: what each one measures, its distance to a goal, and how they are fused.
+
+A part's cost is min(d / unit, 3) / 3, with its distance d to the goal and, as the unit, the spread
+of d among successful ends of the same object. 0 is the goal, 1/3 the spread of successes, 1 far
+away. A fingertip part costs its no-contact value until contact is detected, with hysteresis
+(`ContactReader`): before contact only the cameras can lower the fused cost.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float, Float16, Float32
+from scipy.signal import lfilter
+
+from touchgoal.control.features import IMAGE_PREFIX
+from touchgoal.rewards.features.contact_reading import ContactReadings
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+
+Costs = dict[str, Float[np.ndarray, " n"]]
+
+PARTS = {
+    "front": "front camera, pooled: what the scene looks like",
+    "wrist": "wrist camera, pooled",
+    "wrist_map": "wrist camera at stride 16: where things lie in the hand's frame",
+    "object": "touch embedding: which object is held",
+    "force": "grip force, from the depth of the gel",
+    "centre": "where on the fingertips the object is held",
+    "held": "whether the fingertips touch",
+}
+"""Meaning of each part."""
+
+TOUCH_PARTS = ("object", "force", "centre", "held")
+FUSED, VALUE = "fused", "value"
+VALUE_SHARE = 0.5  # of the value in a fused cost; the rest is the mean of the parts
+_SATURATION = 3.0  # units beyond which a part does not count further
+_FORCE_FLOOR = 0.5  # N, below which the depth of a gel reads noise
+_NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
+_SOFTNESS = 8.0  # exponent of the soft minimum: of 10 equal goals and one at half their distance, .53
+_CHUNK = 256  # frames of maps in float32 at once
+SMOOTHING = 0.1
+"""Time constant of the causal smoothing, s."""
+
+
+def part_distances(
+    episode: EmbeddedEpisode, goal: EmbeddedGoal
+) -> dict[str, Float[np.ndarray, "n g"]]:
+    """Return the distance of each frame to each goal, for the parts that both have.
+
+    Pictures: cosine distance, at stride 16 its mean over positions. Object: half the squared
+    distance of embeddings. Force: |log ratio| of the mean over the fingertips. Centre: m. Held: 0
+    or 1. The last four are means over the fingertips.
+    """
+    distances = {}
+    for key, camera in goal.cameras.items():
+        if (mine := episode.cameras.get(key)) is None:
+            continue
+        name = key.removeprefix(IMAGE_PREFIX)
+        distances[name] = cosine_distances(mine.pooled, camera.pooled)
+        if name == "wrist" and mine.map is not None and camera.map is not None:
+            distances["wrist_map"] = map_distances(mine.map, camera.map)
+    if goal.touch is not None and goal.readings is not None and episode.readings is not None:
+        distances["object"] = object_distances(episode.touches(), goal.touch)
+        distances |= contact_distances(episode.readings, goal.readings)
+    return distances
+
+
+def cosine_distances(
+    mine: Float32[np.ndarray, "n d"], goals: Float32[np.ndarray, "g d"]
+) -> Float[np.ndarray, "n g"]:
+    """Return 1 - cos between unit vectors."""
+    return 1 - mine.astype(np.float64) @ goals.astype(np.float64).T
+
+
+def map_distances(
+    mine: Float16[np.ndarray, "n c y x"], goals: Float16[np.ndarray, "g c y x"]
+) -> Float[np.ndarray, "n g"]:
+    """Return 1 - cos at each position of two maps, mean over the positions."""
+    theirs, positions = _unit_map(goals), goals.shape[2] * goals.shape[3]
+    chunks = [_unit_map(mine[i : i + _CHUNK]) @ theirs.T for i in range(0, len(mine), _CHUNK)]
+    return 1 - np.concatenate(chunks).astype(np.float64) / positions
+
+
+def object_distances(
+    touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "sides g k"]
+) -> Float[np.ndarray, "n g"]:
+    """Return half the squared distance of embeddings: 1 - cos for unit vectors, 0 for equal ones."""
+    mine, theirs = touch.astype(np.float64), goals.astype(np.float64)
+    square = (mine**2).sum(-1)[:, :, None] + (theirs**2).sum(-1)[:, None]
+    return (square / 2 - mine @ theirs.transpose(0, 2, 1)).mean(0)
+
+
+def contact_distances(
+    mine: ContactReadings, goal: ContactReadings
+) -> dict[str, Float[np.ndarray, "n g"]]:
+    """Return the distances of force (log ratio), centre (m) and of being held (0 or 1)."""
+    apart = mine.touching[:, :, None] != goal.touching[:, None]
+    distances = {"held": apart.any(0).astype(np.float64)}
+    if mine.force is not None and goal.force is not None:
+        force, wanted = (np.log(r.astype(np.float64).mean(0) + _FORCE_FLOOR) for r in (mine.force, goal.force))
+        distances["force"] = np.abs(force[:, None] - wanted)
+    if mine.centre is not None and goal.centre is not None:
+        away = np.linalg.norm(mine.centre[:, :, None] - goal.centre[:, None], axis=-1)
+        distances["centre"] = np.where(apart, _NO_CONTACT, away).mean(0).astype(np.float64)
+    return distances
+
+
+def soft_minimum(distances: Float[np.ndarray, "n g"]) -> Float[np.ndarray, " n"]:
+    """Return the power mean of exponent -8 over the goals: the nearest one counts most.
+
+    It is in the unit of the distances, lies between the smallest and the mean, and is a single
+    distance itself.
+    """
+    if distances.shape[1] == 1:
+        return distances[:, 0]
+    smallest = np.maximum(distances.min(1, keepdims=True), 1e-12)
+    ratios = (np.maximum(distances, 1e-12) / smallest) ** -_SOFTNESS
+    return smallest[:, 0] * ratios.mean(1) ** (-1 / _SOFTNESS)
+
+
+def part_costs(
+    episode: EmbeddedEpisode, goal: EmbeddedGoal, units: Mapping[str, float]
+) -> Costs:
+    """Return the cost of each part that has a unit, in [0, 1]; fingertip parts gated by contact."""
+    distances = part_distances(episode, goal)
+    costs = {
+        name: np.minimum(soft_minimum(distances[name]) / units[name], _SATURATION) / _SATURATION
+        for name in PARTS
+        if name in distances and name in units
+    }
+    if episode.readings is None or goal.readings is None:
+        return costs
+    touching = episode.readings.touching.any(0)
+    wanted = bool(goal.readings.touching.any())
+    gated = {k: gate(c, touching, wanted) for k, c in costs.items() if k in TOUCH_PARTS}
+    return costs | gated
+
+
+def gate(
+    cost: Float[np.ndarray, " n"], touching: Bool[np.ndarray, " n"], goal_touches: bool
+) -> Float[np.ndarray, " n"]:
+    """Return a fingertip part's cost, without contact 1, or 0 if the goal has no contact either."""
+    return np.where(touching, cost, float(goal_touches))
+
+
+def fuse(parts: Mapping[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, " n"]:
+    """Return the mean of the parts, or with a value half of it and half of their mean."""
+    mean = np.mean([cost for name, cost in parts.items() if name != VALUE], axis=0)
+    if VALUE not in parts:
+        return mean
+    return VALUE_SHARE * parts[VALUE] + (1 - VALUE_SHARE) * mean
+
+
+def smooth(
+    cost: Float[np.ndarray, " n"], fps: float, before: float | None = None
+) -> Float[np.ndarray, " n"]:
+    """Return exponentially smoothed costs, each from frames up to its own.
+
+    `before` is the smoothed cost of the frame before, None at the beginning, so that pieces of a
+    curve are smoothed as the whole.
+    """
+    keep = np.exp(-1 / (fps * SMOOTHING))
+    start = cost[0] if before is None else before
+    return lfilter([1 - keep], [1, -keep], cost, zi=[keep * start])[0]
+
+
+def _unit_map(maps: Float16[np.ndarray, "n c y x"]) -> Float32[np.ndarray, "n cyx"]:
+    whole = maps.astype(np.float32)
+    whole /= np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-6)
+    return whole.reshape(len(whole), -1)
