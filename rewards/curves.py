@@ -1,12 +1,14 @@
-"""Cost and reward curves of one trajectory: per frame and modality, a distance to the goal.
+"""Cost and reward curves of one trajectory: per frame and part, a distance to the goal.
 
-"image+tactile" and "image+text" are fused: the mean of two normalised costs. The value of frame t
-depends only on frames up to t, but for the background of a fingertip (the median of the first 5
-frames) and a goal that is a frame of the trajectory itself (`Curves.same_episode`).
+The parts (`distance.parts`) and their fusion, "fused", lie in [0, 1]. Beside them stand the plain
+embedding distances of the modalities, "image", "tactile" and "text"; "image+tactile" and
+"image+text" are means of two. The value of frame t depends only on frames up to t, but for the
+background of a fingertip (the median of the first 5 frames) and a goal that is a frame of the
+trajectory itself (`Curves.same_episode`).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -22,8 +24,8 @@ if TYPE_CHECKING:
 
 FUSED = {"image+tactile": ("image", "tactile"), "image+text": ("image", "text")}
 
-GAMMA = 0.99
-"""Default discount of the potential-based reward."""
+GAMMA = 1.0
+"""Default discount a second of the potential-based reward: standing still pays nothing."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,8 @@ class Curves:
         raw: cosine distance 1 - cos in [0, 2] per frame, by modality.
         normalised: distance in units of the normalizer (1 the usual start, 0 the usual end, below
             0 nearer than that), by modality; empty without one.
+        parts: smoothed cost of each part and "fused" per frame, in [0, 1]; empty without a
+            normalizer.
         same_episode: modalities whose goal is a frame of this trajectory itself.
         note: which normalizer was used, or why there is none, for people.
     """
@@ -62,6 +66,7 @@ class Curves:
     contact: Contact
     raw: Mapping[str, Float[np.ndarray, " n"]]
     normalised: Mapping[str, Float[np.ndarray, " n"]]
+    parts: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
     same_episode: frozenset[str] = frozenset()
     note: str = ""
 
@@ -75,15 +80,13 @@ class Curves:
 
     @property
     def costs(self) -> dict[str, Float[np.ndarray, " n"]]:
-        """Costs by name of the curve: normalised and fused; raw ones without a normalizer."""
+        """Costs by name of the curve: parts and normalised distances; raw without a normalizer.
+
+        A normalised distance is below 0 where nearer to the goal than the usual end.
+        """
         if not self.normalised:
             return {name: np.maximum(d, 0) for name, d in self.raw.items()}  # rounding: -1e-7
-        return add_fused_curves({name: np.maximum(d, 0) for name, d in self.normalised.items()})
-
-    @property
-    def unclipped(self) -> dict[str, Float[np.ndarray, " n"]]:
-        """The same, below 0 where nearer than the usual end: to rank frames that cost 0."""
-        return add_fused_curves(self.normalised) if self.normalised else dict(self.raw)
+        return {**self.parts, **add_fused_curves(self.normalised)}
 
     @property
     def rewards(self) -> dict[str, Float[np.ndarray, " n"]]:
@@ -91,8 +94,12 @@ class Curves:
         return {name: state_reward(d) for name, d in self.costs.items()}
 
     def potential_rewards(self, gamma: float = GAMMA) -> dict[str, Float[np.ndarray, " n"]]:
-        """Return the potential-based reward of the step into each frame, by name of the curve."""
-        return {name: potential_reward(d, gamma) for name, d in self.costs.items()}
+        """Return the potential-based reward of the step into each frame, by name of the curve.
+
+        `gamma` is the discount a second. An algorithm that discounts by g a frame wants g^fps.
+        """
+        step = gamma ** (1 / self.fps)
+        return {name: potential_reward(d, step) for name, d in self.costs.items()}
 
     @property
     def unit(self) -> str:
@@ -127,12 +134,11 @@ def state_reward(cost: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return 0.0 - cost  # no negative zeros in the files
 
 
-def potential_reward(
-    cost: Float[np.ndarray, " n"], gamma: float = GAMMA
-) -> Float[np.ndarray, " n"]:
+def potential_reward(cost: Float[np.ndarray, " n"], gamma: float) -> Float[np.ndarray, " n"]:
     """Return F_t = gamma Phi_t - Phi_{t-1} with Phi = -cost, F_0 = 0 (Ng et al. 1999, equation 2).
 
-    With gamma = 1 it sums to cost_0 - cost_T over any path.
+    `gamma` is the discount a step. With 1 it sums to cost_0 - cost_T over any path, 0 over a hold.
+    With less, a hold pays (1 - gamma) cost a step: distance is rewarded, and the more the longer.
     """
     potential = state_reward(cost)
     return np.concatenate([np.zeros(1), gamma * potential[1:] - potential[:-1]])

@@ -38,6 +38,13 @@ class Inputs:
     sensor: str | None = None  # name of the fingertip sensor; None if unknown
     scene: str = "unknown"  # where they were recorded, see `scene_of`
     length: int | None = None  # number of frames of the shortest; None if unknown
+    cameras: tuple[str, ...] = ()  # keys of all cameras
+    task: str = ""  # task in words, "" if unknown or if there are several
+
+    @property
+    def fitted_task(self) -> str:
+        """Task that a value is fitted to: the simulated scene, else the task in words."""
+        return self.scene if self.scene.startswith("simulated") else self.task
 
     @property
     def modalities(self) -> tuple[Modality, ...]:

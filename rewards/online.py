@@ -7,13 +7,20 @@ import numpy as np
 import torch
 
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.control.features import CONTROL_HZ, FRONT, IMAGE_PREFIX, TACTILE, Observation
+from touchgoal.control.features import (
+    CAMERAS,
+    CONTROL_HZ,
+    FRONT,
+    IMAGE_PREFIX,
+    TACTILE,
+    Observation,
+)
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.episodes.touches import touch_background
-from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.normalizer import REAL_SCENE
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.distance.parts import FUSED
+from touchgoal.rewards.features.embedded import EmbeddedGoal
+from touchgoal.rewards.features.feature_stream import FeatureStream
 from touchgoal.rewards.goals import Inputs, parse_goal
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.reward_model import RewardModel, load_reward_model
@@ -44,35 +51,37 @@ class CostMeter:
             )
         self._model, self._embedder = model, model.embedder
         self._goal: EmbeddedGoal | None = None
+        self._stream: FeatureStream | None = None
+        self._background_ticks = 0  # that the stream's background is the median of
+        self._parts: dict[str, float] = {}  # cost of each part at the tick before
 
     def measure(self, observation: Observation, first: Sequence[Observation]) -> float:
-        """Return the cost of a tick; `first` are the run's first ticks in order, at most five."""
-        tick = self._embed(observation, first)
-        if self._goal is None:
-            self._goal = self._embedder.embed_goal(self._model.goal, tick)
-        curves = compute_curves(tick, self._goal, self._model.normalizer)
-        return float(np.mean([curves.costs[name][0] for name in curves.raw]))
+        """Return the cost of a tick: fused, or the mean over the modalities without parts.
 
-    def _embed(self, observation: Observation, first: Sequence[Observation]) -> EmbeddedEpisode:
-        """Return one tick as an episode."""
-        sides = tuple(key for key in TACTILE if key in observation)
-        touch = [
-            self._embedder.embed_touch(
-                observation[key][None], touch_background(np.stack([tick[key] for tick in first]))
-            )
-            for key in sides
-        ]
-        front = observation.get(FRONT)
-        return EmbeddedEpisode(
-            source="this run",
-            fps=CONTROL_HZ,
-            contact=Contact(None, "not looked for"),
-            made_with=self._embedder.made_with,
-            image=None if front is None else self._embedder.embed_pictures(front[None]),
-            sides=sides,
-            touch=np.stack(touch) if touch else None,
-            words=self._embedder.knows_words,
-        )
+        `first` are the run's first ticks in order, at most five. While more of them come in, the
+        background changes, and they are measured anew.
+        """
+        ticks = [observation]
+        if self._stream is None or len(first) > self._background_ticks:
+            before = [tick for tick in first if tick is not observation]
+            ticks = [*before, observation]
+            self._stream = self._embedder.stream(_stacked(first), CONTROL_HZ, "this run")
+            self._background_ticks, self._parts = len(first), {}
+        trajectory = self._stream.embed(_stacked(ticks))
+        if self._goal is None:
+            self._goal = self._embedder.embed_goal(self._model.goal, trajectory)
+        model = self._model
+        curves = compute_curves(trajectory, self._goal, model.normalizer, model.value, self._parts)
+        self._parts = {name: float(cost[-1]) for name, cost in curves.parts.items()}
+        if FUSED in curves.parts:
+            return self._parts[FUSED]
+        return float(np.mean([curves.costs[name][-1] for name in curves.raw]))
+
+
+def _stacked(ticks: Sequence[Observation]) -> dict[str, np.ndarray]:
+    """Return the images of some ticks by key."""
+    keys = [key for key in (*CAMERAS, *TACTILE) if key in ticks[0]]
+    return {key: np.stack([tick[key] for tick in ticks]) for key in keys}
 
 
 class OnlineCost:
@@ -116,12 +125,15 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
     UserError: a goal, encoder or normalizer that does not fit the cell.
     """
     simulated = cell.arm == "sim" or bool(cell.task.twin)
+    cameras = tuple(key for key in CAMERAS if key.removeprefix(IMAGE_PREFIX) in cell.cameras)
     inputs = Inputs(
         name="the cell",
-        camera=FRONT if FRONT.removeprefix(IMAGE_PREFIX) in cell.cameras else None,
+        camera=FRONT if FRONT in cameras else None,
         sides=TACTILE if cell.fingertips is not None else (),
         sensor=cell.sensor,
         scene=f"simulated {cell.task.name}" if simulated else REAL_SCENE,
+        cameras=cameras,
+        task=cell.task.instruction or cell.task.name,
     )
     goals = [parse_goal(text) for text in cell.task.rewards]
     task = cell.task

@@ -15,6 +15,8 @@ from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNo
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
 from touchgoal.rewards.goals import Goal, GoalSpec, Inputs, assign_goals, check_goal
+from touchgoal.rewards.value import REMEDY as VALUE_REMEDY
+from touchgoal.rewards.value import VALUE_FORMAT, Value
 from touchgoal.runtime.errors import UserError
 
 _FIT = "touchgoal fit-normalizer, on successful episodes of your own"
@@ -28,11 +30,13 @@ class RewardModel:
     goal: Goal  # the goal of each modality
     normalizer: DistanceNormalizer | None  # normalizer of the distances; None for raw ones
     note: str  # which normalizer, or why there is none, for people
+    value: Value | None = None  # value of the task, if one lies beside the normalizer
 
     def curves(self, trajectory: EmbeddedEpisode) -> Curves:
         """Return the curves of a trajectory that this model's embedder embedded."""
         goal = self.embedder.embed_goal(self.goal, trajectory)
-        return replace(compute_curves(trajectory, goal, self.normalizer), note=self.note)
+        curves = compute_curves(trajectory, goal, self.normalizer, self.value)
+        return replace(curves, note=self.note)
 
     def provenance(self) -> dict[str, str]:
         """Return what the curves are made with, ready for JSON."""
@@ -51,7 +55,8 @@ def load_reward_model(
 
     `normalizer`: a file of `fit-normalizer`, one already read, "encoder" for the one in the touch
     encoder's folder, "none" for raw distances, or None for the encoder's one if it was fitted on
-    trajectories of this scene, else raw distances. UserError: whatever would stop the measurement.
+    trajectories of this scene, else raw distances. A value that lies beside the file is used.
+    UserError: whatever would stop the measurement.
     """
     if isinstance(towers, str) or towers is None:
         picture_words = towers not in (None, OfflineTowers.name)
@@ -59,26 +64,42 @@ def load_reward_model(
         picture_words = towers.pretrained_together
     goal = assign_goals(goals, inputs.modalities, picture_words)
     check_goal(goal, inputs)
+    name, value_folder = "the given normalizer", None
     if isinstance(normalizer, str | Path) and str(normalizer) not in ("encoder", "none"):
-        name, normalizer = normalizer, DistanceNormalizer.load(Path(normalizer))
-    else:
-        name = "the given normalizer"
+        name, value_folder = normalizer, Path(normalizer).parent
+        normalizer = DistanceNormalizer.load(Path(normalizer))
     embedder, folder = load_embedder(inputs, encoder, towers, device)
     check_words(goals, embedder.encoder)
     if isinstance(normalizer, DistanceNormalizer):
         if reason := _mismatch(normalizer, inputs, goal, embedder):
             raise UserError(f"{name} does not apply here: {reason}; {REMEDY}")
-        return RewardModel(embedder, goal, normalizer, f"normalizer: {name}")
+        value = _value_in(value_folder, inputs, embedder)
+        note = f"normalizer: {name}" + ("" if value is None else ", with the value beside it")
+        return RewardModel(embedder, goal, normalizer, note, value)
     if normalizer == "none":
+        embedder.with_parts = False
         return RewardModel(embedder, goal, None, "normalizer: none, raw cosine distances")
     found, reason = _normalizer_of_encoder(folder, inputs, goal, embedder, normalizer is None)
     if found is None and normalizer == "encoder":
         raise UserError(f"the encoder's normalizer does not apply: {reason}; {REMEDY}")
     if found is None:
+        embedder.with_parts = False
         return RewardModel(
             embedder, goal, None, f"raw cosine distances, for {reason}; to normalise them: {_FIT}"
         )
-    return RewardModel(embedder, goal, found, f"normalizer: {reason}")
+    value = _value_in(folder, inputs, embedder)
+    note = f"normalizer: {reason}" + ("" if value is None else ", with the value beside it")
+    return RewardModel(embedder, goal, found, note, value)
+
+
+def _value_in(folder: Path | None, inputs: Inputs, embedder: EpisodeEmbedder) -> Value | None:
+    """Return the value beside a normalizer, None without one; UserError if it does not hold here."""
+    if folder is None or not VALUE_FORMAT.weights_path(folder).is_file():
+        return None
+    value = Value.load(folder)
+    if reason := value.mismatch(inputs.fitted_task, inputs.cameras, embedder.made_with.towers):
+        raise UserError(f"the value in {folder} does not apply here: {reason}; {VALUE_REMEDY}")
+    return value
 
 
 def _normalizer_of_encoder(

@@ -55,6 +55,7 @@ class EpisodeSource:
             sensor=next(iter(self._sensors()), None),
             scene=scene_of(episodes.features),
             length=episodes.lengths[shortest],
+            cameras=tuple(key for key in CAMERAS if key in episodes.features),
         )
 
     @property
@@ -64,7 +65,7 @@ class EpisodeSource:
 
     @property
     def _keys(self) -> list[str]:
-        wanted = (self.camera, *TACTILE, TRUTH_CONTACT)
+        wanted = (*CAMERAS, *TACTILE, TRUTH_CONTACT)
         return [key for key in wanted if key in self.episodes.features]
 
     def _sensors(self) -> set[str]:

@@ -334,7 +334,7 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_p
     noise = np.random.default_rng(1).integers(0, 30, (5, *TOUCH["left"].shape[1:]), dtype=np.uint8)
     left = np.concatenate([TOUCH["left"][:5] + noise, TOUCH["left"][5:]])
     embedder = EpisodeEmbedder(PaintTowers(), encoder)
-    ends = {"image": 1.0, "text": 1.0}, {"image": 0.1, "text": 0.2}
+    ends = {"image": 1.0, "text": 1.0}, {"image": 0.1, "text": 0.2}, {}
     normalizer = DistanceNormalizer(*ends, {}, embedder.made_with, "recorded, not simulated", 3)
     goals = [GoalPicture(tmp_path / "end.png"), Sentence("soft")]
     frames = {FRONT: IMAGES, TACTILE_LEFT: left, TACTILE_RIGHT: TOUCH["right"]}

@@ -270,11 +270,11 @@ def _fall_after_contact(curves: Curves) -> float:
 def failure_auc(tests: Sequence[HeldOutEpisode], outcome: str) -> dict[str, float]:
     """Return the AUC of the last cost, success against each failure, by kind of curve."""
     done, failed = (
-        [t.other.unclipped for t in tests if t.outcome == kind] for kind in ("success", outcome)
+        [t.other.costs for t in tests if t.outcome == kind] for kind in ("success", outcome)
     )
     return {
         name: _auc([costs[name][-1] for costs in done], [costs[name][-1] for costs in failed])
-        for name in tests[0].other.unclipped
+        for name in tests[0].other.costs
     }
 
 

@@ -140,7 +140,9 @@ class OfflineTowers:
     @torch.no_grad()
     def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
         """Return the mean of the last hidden states, as sentence-transformers does."""
-        return _joined(_in_batches(lambda batch: self.text_tower(batch).cpu(), texts), self.text_dim)
+        return _joined(
+            _in_batches(lambda batch: self.text_tower(batch).cpu(), texts), self.text_dim
+        )
 
 
 class ClipTowers:

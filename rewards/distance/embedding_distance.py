@@ -3,12 +3,23 @@
 All distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over the fingertips.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float, Float32
 
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
+from touchgoal.rewards.distance.parts import (
+    VALUE,
+    WORDS,
+    cosine_distances,
+    part_costs,
+    smooth_and_fuse,
+    soft_minimum,
+)
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.value import Value
 
 
 def compute_distances(
@@ -17,24 +28,38 @@ def compute_distances(
     """Return the raw cosine distance per frame, for each modality that has a goal."""
     raw = {}
     if goal.image is not None:
-        raw["image"] = image_distances(episode.pictures(), goal.image[None])[:, 0]
+        raw["image"] = soft_minimum(cosine_distances(episode.pictures(), goal.image))
     if goal.touch is not None:
-        raw["tactile"] = touch_distances(episode.touches(), goal.touch[None])[:, 0]
+        raw["tactile"] = soft_minimum(touch_distances(episode.touches(), goal.touch))
     if goal.text is not None:
-        raw["text"] = text_distances(episode.touches(), goal.text[None])[:, 0]
+        raw["text"] = soft_minimum(text_distances(episode.touches(), goal.text))
     return raw
 
 
 def compute_curves(
-    episode: EmbeddedEpisode, goal: EmbeddedGoal, normalizer: DistanceNormalizer | None
+    episode: EmbeddedEpisode,
+    goal: EmbeddedGoal,
+    normalizer: DistanceNormalizer | None,
+    value: Value | None = None,
+    before: Mapping[str, float] | None = None,
 ) -> Curves:
     """Return the curves of one trajectory to one goal; without a normalizer raw, and none fused.
 
+    `before` are the costs of the parts at the frame before, if the trajectory comes in pieces.
     UserError: the normalizer lacks a modality or was fitted for something else.
     """
     raw = compute_distances(episode, goal)
     same = goal.same_episode
-    normalised = normalizer.normalise(raw, episode.made_with, same) if normalizer else {}
+    normalised, parts = {}, {}
+    if normalizer is not None:
+        normalised = normalizer.normalise(raw, episode.made_with, same)
+    if normalizer is not None and normalizer.unit:
+        parts = part_costs(episode, goal, normalizer.unit)
+        if value is not None:
+            parts[VALUE] = 1 - value.progress(episode.cameras)
+        if "text" in normalised:
+            parts[WORDS] = np.clip(normalised["text"], 0, 1)
+        parts = smooth_and_fuse(parts, episode.fps, before)
     return Curves(
         episode.source,
         goal.forms,
@@ -42,22 +67,16 @@ def compute_curves(
         episode.contact,
         raw,
         normalised,
+        parts,
         same.intersection(raw),
     )
 
 
-def image_distances(
-    image: Float32[np.ndarray, "n d"], goals: Float32[np.ndarray, "g d"]
-) -> Float[np.ndarray, "n g"]:
-    """Return the cosine distance of each image to each goal."""
-    return 1 - image.astype(np.float64) @ goals.astype(np.float64).T
-
-
 def touch_distances(
-    touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "g sides k"]
+    touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "sides g k"]
 ) -> Float[np.ndarray, "n g"]:
     """Return the distance of each touch to each goal's same fingertip, mean over the fingertips."""
-    cosine = np.einsum("snk,gsk->ng", touch, goals, dtype=np.float64)
+    cosine = np.einsum("snk,sgk->ng", touch, goals, dtype=np.float64)
     return 1 - cosine / len(touch)
 
 

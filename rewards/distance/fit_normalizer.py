@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.rewards.distance.embedding_distance import (
-    image_distances,
     text_distances,
     touch_distances,
 )
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, median_name
-from touchgoal.rewards.features.embedded import EmbeddedEpisode
+from touchgoal.rewards.distance.parts import SMALLEST_UNIT, cosine_distances, part_distances
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, goal_at_every_frame
 from touchgoal.rewards.goals import Modality
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
@@ -22,6 +22,8 @@ END_FRAMES = 5
 MIN_SEPARATED = 0.75
 """Least share of (episode, goal) pairs whose end must be nearer the goal than its start; 0.5 is
 chance. Below it, one unit of the normalised distance would mostly be noise."""
+
+_UNIT_QUANTILE = 0.9
 
 MIN_GAP = 1e-4
 """Least raw distance between the start and the goal median; float32 resolves about 1e-6."""
@@ -51,7 +53,30 @@ def fit_normalizer(
             name = median_name(modality, same_episode)
             separated[name] = _check_separation(name, starts, ends)
             start[name], goal[name] = float(np.median(starts)), float(np.median(ends))
-    return DistanceNormalizer(start, goal, separated, episodes[0].made_with, scene, len(episodes))
+    units, made_with = fit_units(episodes), episodes[0].made_with
+    return DistanceNormalizer(start, goal, units, separated, made_with, scene, len(episodes))
+
+
+def fit_units(episodes: Sequence[EmbeddedEpisode]) -> dict[str, float]:
+    """Return the unit of each part: the 90 % quantile of its distance between two successful ends.
+
+    Ends with the same object are compared; empty if no two share one.
+    """
+    by_object: dict[str, list[EmbeddedEpisode]] = {}
+    for episode in episodes:
+        by_object.setdefault(episode.object, []).append(episode)
+    between: dict[str, list[np.ndarray]] = {}
+    for group in by_object.values():
+        ends = [episode.take(slice(len(episode) - 1, None)) for episode in group]
+        together = ends[0].extended(ends[1:])
+        for name, d in part_distances(together, goal_at_every_frame(together)).items():
+            between.setdefault(name, []).append(d[~np.eye(len(ends), dtype=bool)])
+    pooled = {name: np.concatenate(d) for name, d in between.items()}
+    return {
+        name: max(float(np.quantile(d, _UNIT_QUANTILE)), SMALLEST_UNIT[name])
+        for name, d in pooled.items()
+        if len(d)
+    }
 
 
 def _check_separation(
@@ -122,8 +147,8 @@ def _distances_to_goals(
     episode: EmbeddedEpisode, goals: Sequence[EmbeddedEpisode], modality: Modality
 ) -> Float[np.ndarray, "n g"]:
     if modality == "image":
-        return image_distances(episode.pictures(), np.stack([o.pictures()[-1] for o in goals]))
+        return cosine_distances(episode.pictures(), np.stack([o.pictures()[-1] for o in goals]))
     if modality == "tactile":
-        return touch_distances(episode.touches(), np.stack([o.touches()[:, -1] for o in goals]))
+        return touch_distances(episode.touches(), np.stack([o.touches()[:, -1] for o in goals], 1))
     assert episode.descriptions is not None  # checked with the training episodes
     return text_distances(episode.touches(), episode.descriptions)

@@ -18,6 +18,7 @@ from touchgoal.runtime.errors import UserError
 
 NORMALIZER = "normalizer.json"
 """Name of the file in an encoder's folder, fitted on the encoder's training episodes."""
+_FORMAT = 2
 REMEDY = "fit one with touchgoal fit-normalizer, or give --normalizer none for raw distances"
 REAL_SCENE = "recorded, not simulated"
 
@@ -55,14 +56,16 @@ def median_name(modality: str, same_episode: bool) -> str:
 
 @dataclass(frozen=True)
 class DistanceNormalizer:
-    """Raw cosine distances at which successful training episodes start and end.
+    """Raw cosine distances at which successful training episodes start and end; units of the parts.
 
     n(d) = (d - goal) / (start - goal): 1 at the usual start, 0 at the usual end, below 0 nearer than
-    that. There is one pair of medians for each `median_name`.
+    that. There is one pair of medians for each `median_name`. The unit of a part of the cost
+    (`distance.parts`) is the spread of its distance among successful ends.
     """
 
     start: dict[str, float]  # median raw distance of the start of a training episode to a goal
     goal: dict[str, float]  # the same for its end
+    unit: dict[str, float]  # unit of each part's distance; empty if no two share an object
     separated: dict[str, float]  # share of (episode, goal) pairs whose end is nearer than the start
     source: EmbeddingSource  # encoders, camera and sensor of the embeddings
     scene: str  # see `scene_of`
@@ -114,17 +117,26 @@ class DistanceNormalizer:
 
     def save(self, path: Path) -> None:
         """Write JSON, atomically."""
-        write_file(path, (json.dumps(asdict(self), indent=2) + "\n").encode())
+        content = {"format": _FORMAT, **asdict(self)}
+        write_file(path, (json.dumps(content, indent=2) + "\n").encode())
 
     @classmethod
     def load(cls, path: Path) -> "DistanceNormalizer":
-        """Read a file that `save` wrote. UserError: no such file, or not a normalizer."""
+        """Read a file that `save` wrote.
+
+        UserError: no such file, not a normalizer, or one of an earlier format.
+        """
         if not path.is_file():
             raise UserError(
                 f"there is no normalizer at {path}: make one with touchgoal fit-normalizer"
             )
         try:
             content = json.loads(path.read_text())
+            if content.pop("format", 1) != _FORMAT:
+                raise UserError(
+                    f"{path} was fitted by another version of touchgoal and lacks the units of the "
+                    "parts: fit it anew with touchgoal fit-normalizer"
+                )
             if content.keys() != {f.name for f in fields(cls)}:
                 raise ValueError
             return cls(**content | {"source": EmbeddingSource(**content["source"])})

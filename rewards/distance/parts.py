@@ -26,16 +26,28 @@ PARTS = {
     "force": "grip force, from the depth of the gel",
     "centre": "where on the fingertips the object is held",
     "held": "whether the fingertips touch",
+    "words": "touch against a sentence, normalised and clipped to [0, 1]",
+    "value": "1 - the share of the way that a value sees, whatever the goal",
 }
 """Meaning of each part."""
 
 TOUCH_PARTS = ("object", "force", "centre", "held")
-FUSED, VALUE = "fused", "value"
+FUSED, VALUE, WORDS = "fused", "value", "words"
 VALUE_SHARE = 0.5  # of the value in a fused cost; the rest is the mean of the parts
+SMALLEST_UNIT = {
+    "front": 1e-3,
+    "wrist": 1e-3,
+    "wrist_map": 1e-2,
+    "object": 1e-3,
+    "force": 0.05,  # log ratio
+    "centre": 2e-4,  # m
+    "held": 1 / 3,  # so that a missing fingertip costs 1
+}
+"""Least unit of each part, about the noise of a camera: some demonstrations end almost alike."""
 _SATURATION = 3.0  # units beyond which a part does not count further
 _FORCE_FLOOR = 0.5  # N, below which the depth of a gel reads noise
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
-_SOFTNESS = 8.0  # exponent of the soft minimum: of 10 equal goals and one at half their distance, .53
+_SOFTNESS = 8.0  # exponent of the soft minimum
 _CHUNK = 256  # frames of maps in float32 at once
 SMOOTHING = 0.1
 """Time constant of the causal smoothing, s."""
@@ -96,7 +108,9 @@ def contact_distances(
     apart = mine.touching[:, :, None] != goal.touching[:, None]
     distances = {"held": apart.any(0).astype(np.float64)}
     if mine.force is not None and goal.force is not None:
-        force, wanted = (np.log(r.astype(np.float64).mean(0) + _FORCE_FLOOR) for r in (mine.force, goal.force))
+        force, wanted = (
+            np.log(r.astype(np.float64).mean(0) + _FORCE_FLOOR) for r in (mine.force, goal.force)
+        )
         distances["force"] = np.abs(force[:, None] - wanted)
     if mine.centre is not None and goal.centre is not None:
         away = np.linalg.norm(mine.centre[:, :, None] - goal.centre[:, None], axis=-1)
@@ -105,21 +119,16 @@ def contact_distances(
 
 
 def soft_minimum(distances: Float[np.ndarray, "n g"]) -> Float[np.ndarray, " n"]:
-    """Return the power mean of exponent -8 over the goals: the nearest one counts most.
+    """Return the mean over the goals with weights d^-8: the nearest one counts most.
 
-    It is in the unit of the distances, lies between the smallest and the mean, and is a single
-    distance itself.
+    Of one goal it is the distance itself.
     """
-    if distances.shape[1] == 1:
-        return distances[:, 0]
-    smallest = np.maximum(distances.min(1, keepdims=True), 1e-12)
-    ratios = (np.maximum(distances, 1e-12) / smallest) ** -_SOFTNESS
-    return smallest[:, 0] * ratios.mean(1) ** (-1 / _SOFTNESS)
+    positive = np.maximum(distances, 1e-12)  # rounding: -1e-7
+    weights = (positive.min(1, keepdims=True) / positive) ** _SOFTNESS
+    return (weights * distances).sum(1) / weights.sum(1)
 
 
-def part_costs(
-    episode: EmbeddedEpisode, goal: EmbeddedGoal, units: Mapping[str, float]
-) -> Costs:
+def part_costs(episode: EmbeddedEpisode, goal: EmbeddedGoal, units: Mapping[str, float]) -> Costs:
     """Return the cost of each part that has a unit, in [0, 1]; fingertip parts gated by contact."""
     distances = part_distances(episode, goal)
     costs = {
@@ -142,22 +151,28 @@ def gate(
     return np.where(touching, cost, float(goal_touches))
 
 
-def fuse(parts: Mapping[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, " n"]:
-    """Return the mean of the parts, or with a value half of it and half of their mean."""
-    mean = np.mean([cost for name, cost in parts.items() if name != VALUE], axis=0)
-    if VALUE not in parts:
-        return mean
-    return VALUE_SHARE * parts[VALUE] + (1 - VALUE_SHARE) * mean
+def smooth_and_fuse(
+    parts: Mapping[str, Float[np.ndarray, " n"]], fps: float, before: Mapping[str, float] | None
+) -> Costs:
+    """Return the smoothed parts and "fused": their mean, or half the value and half that mean.
+
+    `before` has the costs of the frame before, None at the beginning. Empty without parts.
+    """
+    last = before or {}
+    smoothed = {name: smooth(cost, fps, last.get(name)) for name, cost in parts.items()}
+    equal = [cost for name, cost in smoothed.items() if name != VALUE]
+    if not equal:
+        return {}
+    fused = np.mean(equal, axis=0)
+    if VALUE in smoothed:
+        fused = VALUE_SHARE * smoothed[VALUE] + (1 - VALUE_SHARE) * fused
+    return smoothed | {FUSED: fused}
 
 
 def smooth(
     cost: Float[np.ndarray, " n"], fps: float, before: float | None = None
 ) -> Float[np.ndarray, " n"]:
-    """Return exponentially smoothed costs, each from frames up to its own.
-
-    `before` is the smoothed cost of the frame before, None at the beginning, so that pieces of a
-    curve are smoothed as the whole.
-    """
+    """Return exponentially smoothed costs, each from frames up to its own; `before`: the last one."""
     keep = np.exp(-1 / (fps * SMOOTHING))
     start = cost[0] if before is None else before
     return lfilter([1 - keep], [1, -keep], cost, zi=[keep * start])[0]

@@ -119,3 +119,15 @@ class EmbeddedGoal:
     text: Float32[np.ndarray, "g k"] | None = None
     cameras: Mapping[str, CameraFeatures] = field(default_factory=dict)
     readings: ContactReadings | None = None
+
+
+def goal_at_every_frame(frames: EmbeddedEpisode) -> EmbeddedGoal:
+    """Return goals of image and touch, one at each frame of these."""
+    return EmbeddedGoal(
+        forms={},
+        same_episode=frozenset(),
+        image=frames.image,
+        touch=frames.touch,
+        cameras=frames.cameras,
+        readings=frames.readings,
+    )

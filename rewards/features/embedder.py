@@ -29,7 +29,6 @@ from touchgoal.rewards.goals import (
     OwnFrame,
     PictureGoal,
     Sentence,
-    TouchArrays,
     TouchGoal,
     frame_index,
 )

@@ -11,7 +11,7 @@ from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.features.contact_reading import ContactReader, ContactReadings
-from touchgoal.rewards.features.embedded import CameraFeatures, EmbeddedEpisode
+from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.metrics import START_FRAMES
 
 if TYPE_CHECKING:
@@ -37,7 +37,9 @@ class FeatureStream:
         untouched = {side: first[side][:START_FRAMES] for side in sides}
         self._backgrounds = {side: touch_background(frames) for side, frames in untouched.items()}
         sensor = SENSORS.get(embedder.made_with.sensor)
-        self._past: dict[str, np.ndarray] = {}  # newest frames of each side, for encoders of several
+        self._past: dict[
+            str, np.ndarray
+        ] = {}  # newest frames of each side, for encoders of several
         self._readers = {
             side: ContactReader(sensor, frames)
             for side, frames in untouched.items()
@@ -48,7 +50,9 @@ class FeatureStream:
         """Embed the next frames; the first contact is not looked for."""
         embedder, sides = self._embedder, self._sides
         wanted = (*CAMERAS, embedder.camera) if embedder.with_parts else (embedder.camera,)
-        cameras = {k: embedder.embed_camera(frames[k]) for k in dict.fromkeys(wanted) if k in frames}
+        cameras = {
+            k: embedder.embed_camera(frames[k]) for k in dict.fromkeys(wanted) if k in frames
+        }
         main = cameras.get(embedder.camera)
         touch = [self._embed_touch(side, frames[side]) for side in sides]
         return EmbeddedEpisode(

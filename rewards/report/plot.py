@@ -44,7 +44,7 @@ def draw(curves: Curves, gamma: float) -> Figure:
         axes = figure.add_axes((0.095, bottom, 0.725, height))
         for name, line in lines.items():
             width = 2.6 if "+" in name else 1.8
-            style = {"color": COLOR[name], "linestyle": DASHES[name], "linewidth": width}
+            style = {"color": _color(name), "linestyle": DASHES.get(name, "-"), "linewidth": width}
             axes.plot(np.arange(length) / fps, line, **style)
         _frame_axes(axes, label, (length - 1) / fps)
         if k == 0:
@@ -63,6 +63,11 @@ def draw(curves: Curves, gamma: float) -> Figure:
     return figure
 
 
+def _color(name: str) -> str:
+    """Return the colour of a curve: its own, or grey for a part among others."""
+    return COLOR.get(name, "0.2" if name == "fused" else "0.65")
+
+
 def _frame_axes(axes: Axes, label: str, end: float) -> None:
     axes.set_ylabel(label, fontsize=12)
     axes.set_xlim(0, end)
@@ -78,10 +83,10 @@ def _frame_axes(axes: Axes, label: str, end: float) -> None:
 def _frame_costs(axes: Axes, normalised: bool) -> None:
     """Start the cost axis at 0; if normalised, mark where successes usually start and end."""
     high = axes.get_ylim()[1]
-    axes.set_ylim(-0.03 * high, high)
+    axes.set_ylim(min(-0.03 * high, axes.get_ylim()[0]), high)
     if not normalised:
         return
-    axes.set_ylim(-0.04, max(high, 1.2))
+    axes.set_ylim(min(-0.04, axes.get_ylim()[0]), max(high, 1.2))
     # Each name stands where a good curve is not: the start's at the end and the reverse.
     for level, name, x, side in (
         (1, "usual start", 0.995, "right"),
@@ -116,7 +121,7 @@ def _label_lines(axes: Axes, values: Mapping[str, np.ndarray], gap: float) -> No
     names = sorted(values, key=lambda name: values[name][-1])
     ends = np.array([(values[name][-1] - low) / (high - low) for name in names])
     for name, end, height in zip(names, ends, _spread_labels(ends, gap), strict=True):
-        color = COLOR[name]
+        color = _color(name)
         axes.annotate(
             name,
             (1, end),

@@ -1,0 +1,196 @@
+"""Named parts of a cost: distances, units, gate, smoothing, fusion, value; in one go and streamed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, WRIST
+from touchgoal.control.tactile.sensor_models import SENSORS
+from touchgoal.rewards.curves import Contact, potential_reward
+from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, fit_units
+from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
+from touchgoal.rewards.distance.parts import (
+    contact_distances,
+    gate,
+    object_distances,
+    smooth,
+    soft_minimum,
+)
+from touchgoal.rewards.features.contact_reading import ContactReader, ContactReadings
+from touchgoal.rewards.features.embedded import (
+    CameraFeatures,
+    EmbeddedEpisode,
+    goal_at_every_frame,
+)
+from touchgoal.rewards.fit_value import fit_value
+from touchgoal.rewards.value import Value
+from touchgoal.runtime.errors import UserError
+
+N, GRASP = 40, 15
+
+
+def embedded(seed: int, success: bool = True, force: float = 10.0) -> EmbeddedEpisode:
+    """Two cameras that see the progress in their first channel, and a grasp from `GRASP` on."""
+    rng = np.random.default_rng(seed)
+    progress = np.linspace(0, 1 if success else 0.4, N)
+
+    def camera(width: int) -> CameraFeatures:
+        maps = rng.normal(0, 0.1, (N, 4, 3, 3)).astype(np.float32)
+        maps[:, 0, 1, 1] += 2 * progress - 1
+        maps[:, 1] += 1
+        pooled = np.stack([np.cos(progress), np.sin(progress)], 1).astype(np.float32)
+        return CameraFeatures(pooled, maps.astype(np.float16))
+
+    held = np.repeat((np.arange(N) >= GRASP)[None], 2, axis=0)
+    noise = rng.normal(0, 0.1, (2, N)) * held
+    touch = np.stack([held + noise, held + 0 * noise], -1).astype(np.float32) / 2**0.5
+    readings = ContactReadings(
+        held,
+        (held * (force + rng.normal(0, 0.5, (2, N)))).astype(np.float32),
+        (held[..., None] * rng.normal(1e-3, 1e-4, (2, N, 2))).astype(np.float32),
+    )
+    cameras = {FRONT: camera(2), WRIST: camera(2)}
+    return EmbeddedEpisode(
+        source=f"episode {seed}",
+        fps=20.0,
+        contact=Contact(GRASP, "detected"),
+        made_with=EmbeddingSource("offline", FRONT, "encoder", "gelsight_mini"),
+        image=cameras[FRONT].pooled,
+        sides=(TACTILE_LEFT, TACTILE_RIGHT),
+        touch=touch,
+        object="apple",
+        success=success,
+        words=False,
+        cameras=cameras,
+        readings=readings,
+    )
+
+
+@pytest.fixture(scope="module")
+def successes() -> list[EmbeddedEpisode]:
+    return [embedded(seed) for seed in range(6)]
+
+
+@pytest.fixture(scope="module")
+def normalizer(successes: list[EmbeddedEpisode]) -> DistanceNormalizer:
+    return fit_normalizer(successes, ("image", "tactile"), "simulated pick-place")
+
+
+@pytest.fixture(scope="module")
+def value(successes: list[EmbeddedEpisode]) -> Value:
+    return fit_value(successes, "simulated pick-place")
+
+
+def test_a_failure_of_each_part_raises_that_part(
+    successes: list[EmbeddedEpisode], normalizer: DistanceNormalizer, value: Value
+) -> None:
+    goal = goal_at_every_frame(successes[0].take(slice(-1, None)))
+    good, hard, early = (
+        compute_curves(e, goal, normalizer, value).parts
+        for e in (embedded(9), embedded(9, force=40.0), embedded(9, success=False))
+    )
+    assert {name: cost[-1] < 0.5 for name, cost in good.items()} == dict.fromkeys(good, True)
+    assert hard["force"][-1] > good["force"][-1] + 0.4
+    assert hard["front"][-1] == pytest.approx(good["front"][-1])
+    for name in ("front", "wrist", "wrist_map", "value", "fused"):
+        assert early[name][-1] > good[name][-1] + 0.2, name
+    for cost in good.values():
+        assert 0 <= cost.min() and cost.max() <= 1
+
+
+def test_before_contact_the_fingertips_cost_the_same_whatever_they_read(
+    successes: list[EmbeddedEpisode], normalizer: DistanceNormalizer
+) -> None:
+    goal = goal_at_every_frame(successes[0].take(slice(-1, None)))
+    parts = compute_curves(embedded(9), goal, normalizer).parts
+    for name in ("object", "force", "centre", "held"):
+        assert parts[name][:GRASP] == pytest.approx(np.ones(GRASP)), name
+    assert np.ptp(parts["fused"][:GRASP]) > 0.01  # the pictures lead
+    costs, touching = np.array([0.2, 0.3]), np.array([False, True])
+    assert gate(costs, touching, goal_touches=False) == pytest.approx([0, 0.3])
+
+
+def test_pieces_of_a_trajectory_cost_the_same_as_the_whole(
+    successes: list[EmbeddedEpisode], normalizer: DistanceNormalizer, value: Value
+) -> None:
+    """What is streamed never saw what comes later, so the costs are causal, too."""
+    goal = goal_at_every_frame(successes[0].take(slice(-1, None)))
+    whole = compute_curves(embedded(9), goal, normalizer, value).parts
+    before: dict[str, float] = {}
+    for t in range(N):
+        tick = embedded(9).take(slice(t, t + 1))
+        parts = compute_curves(tick, goal, normalizer, value, before).parts
+        before = {name: float(cost[-1]) for name, cost in parts.items()}
+        assert before == pytest.approx({name: cost[t] for name, cost in whole.items()}, abs=1e-6)
+
+
+def test_holding_still_pays_nothing() -> None:
+    hold = np.full(200, 0.7)
+    assert np.abs(potential_reward(hold, 1.0)).max() == 0
+    reaching = np.concatenate([np.linspace(1, 0.7, 20), hold])
+    assert potential_reward(reaching, 1.0).sum() == pytest.approx(0.3)
+
+
+def test_distances_by_hand() -> None:
+    light = ContactReadings(
+        np.array([[True, False]]),
+        np.array([[9.5, 0]], np.float32),
+        np.array([[[3e-3, 0], [0, 0]]], np.float32),
+    )
+    firm = ContactReadings(
+        np.array([[True]]), np.array([[39.5]], np.float32), np.zeros((1, 1, 2), np.float32)
+    )
+    d = contact_distances(light, firm)
+    assert d["force"][:, 0] == pytest.approx([np.log(4), np.log(80)])
+    assert d["centre"][:, 0] == pytest.approx([3e-3, 0.02]) and d["held"][:, 0].tolist() == [0, 1]
+    along, short = np.array([[[1.0, 0]]], np.float32), np.array([[[0.5, 0]]], np.float32)
+    assert object_distances(along, along)[0, 0] == 0
+    assert object_distances(short, along)[0, 0] == pytest.approx(0.125)
+    two = soft_minimum(np.array([[0.1, 0.4], [0.3, 0.3]]))
+    assert two == pytest.approx([0.1, 0.3], abs=1e-4)
+    cost = np.random.default_rng(0).random(9)
+    pieces = [smooth(cost[:4], 20)]
+    pieces.append(smooth(cost[4:], 20, float(pieces[0][-1])))
+    assert np.concatenate(pieces) == pytest.approx(smooth(cost, 20))
+
+
+def test_units_are_those_of_ends_with_the_same_object(successes: list[EmbeddedEpisode]) -> None:
+    units = fit_units(successes)
+    assert units["force"] < 0.3 and units["held"] == pytest.approx(1 / 3)
+    strangers = [replace(e, object=str(i)) for i, e in enumerate(successes)]
+    assert fit_units(strangers) == {}
+
+
+def test_a_value_is_refused_elsewhere(successes: list[EmbeddedEpisode], value: Value) -> None:
+    def why(task: str = "simulated pick-place", towers: str = "offline") -> str | None:
+        return value.mismatch(task, (FRONT, WRIST), towers)
+
+    assert why() is None
+    assert "the task 'simulated pick-place', not 'pour'" in str(why(task="pour"))
+    assert "with the towers offline, not clip" in str(why(towers="clip"))
+    assert "looks through" in str(value.mismatch("simulated pick-place", (FRONT,), "offline"))
+    with pytest.raises(UserError, match="at least 4 successful episodes"):
+        fit_value(successes[:3], "pour")
+    progress = value.progress(embedded(9).cameras)
+    assert np.corrcoef(progress, np.arange(N))[0, 1] > 0.9
+    halfway = {key: camera.take(slice(0, 20)) for key, camera in embedded(9).cameras.items()}
+    assert value.progress(halfway) == pytest.approx(progress[:20], abs=1e-5)
+
+
+def test_a_press_is_read_where_and_how_hard_it_is() -> None:
+    """A disc that darkens the gel right of the middle; the sensor's own file reads a depth of it."""
+    rng = np.random.default_rng(0)
+    gel = np.full((240, 320, 3), 110, np.uint8) + rng.integers(0, 3, (240, 320, 3), dtype=np.uint8)
+    y, x = np.mgrid[:240, :320]
+    ball = np.exp(-((x - 220) ** 2 + (y - 120) ** 2) / 800)
+    pressed = gel.astype(np.float32)
+    pressed[..., 0] += 60 * np.gradient(ball, axis=1) / np.abs(np.gradient(ball, axis=1)).max()
+    frames = np.stack([gel] * 6 + [np.clip(pressed, 0, 255).astype(np.uint8)] * 3)
+    readings = ContactReader(SENSORS["gelsight_mini"], frames[:5]).read(frames)
+    assert readings.touching[0].tolist() == [False] * 6 + [True] * 3
+    assert readings.force is not None and readings.centre is not None
+    assert readings.force[0, :6].tolist() == [0] * 6 and readings.force[0, -1] > 0
+    blind = ContactReader(None, frames[:5]).read(frames)
+    assert blind.touching.tolist() == readings.touching.tolist() and blind.force is None
