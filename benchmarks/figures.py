@@ -40,13 +40,13 @@ def maze(metrics: Metrics, **names: str) -> str:
 
 
 def auc(metrics: Metrics) -> str:
-    """AUC of the last cost, success against a dropped object."""
+    """AUC of the final cost, success against a dropped object."""
     drop = metrics["auc"]["drop"]
     return f"{drop['image']:.2f} by image, {drop['image+tactile']:.2f} by image and touch"
 
 
 def median_rate(metrics: Metrics, start: str, unit: str) -> str:
-    """Range of the median rates of rows that start so."""
+    """Range of the median rates of rows whose name begins with `start`."""
     rates = [row["median"] for row in metrics["rows"] if row["what"].startswith(start)]
     return f"{min(rates):,.0f} to {max(rates):,.0f} {unit}"
 
