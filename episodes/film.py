@@ -17,8 +17,9 @@ from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
 from touchgoal.sim_envs.scene.filming import TICKS_PER_PICTURE
 
-COLORS = ("#0072B2", "#D55E00", "#CC79A7", "#000000", "#009E73")
-"""Okabe and Ito, "Color universal design" (2008): distinct for colour-blind readers."""
+BLACK = "#000000"
+COLORS = ("#0072B2", "#D55E00", "#CC79A7", BLACK, "#009E73", "#56B4E9", "#E69F00", "#7A5C2E")
+"""Okabe and Ito, "Color universal design" (2008), distinct for colour-blind readers, and a brown."""
 _DPI = 100
 _PANEL = 320  # px, width of the curves
 _CAPTION = 24  # px, height of the caption

@@ -119,11 +119,12 @@ class EpisodeWriter:
 class EpisodeSet:
     """A set of episodes for reading, as it was when opened."""
 
-    def __init__(self, root: str | os.PathLike[str]) -> None:
+    def __init__(self, root: str | os.PathLike[str], complete: bool = True) -> None:
         """Open a set.
 
         Args:
             root: Folder of the set, or of the run that recorded it into its `episodes/`.
+            complete: Whether every file must be there; else `read` finds what is missing.
 
         Raises:
             UserError: Not a set, an unknown version, or written by lerobot in part or whole; a
@@ -143,7 +144,7 @@ class EpisodeSet:
                 f"{self.root / set_files.EPISODES} lists {len(self._rows)} of "
                 f"{info['total_episodes']} episodes: {set_files.repair_command(self.root)}"
             )
-        for row in self._rows:  # before any work with the others
+        for row in self._rows if complete else ():  # before any work with the others
             for name in self._files(row):
                 if not (self.root / name).is_file():
                     raise set_files.unreadable(self.root, name, FileNotFoundError())

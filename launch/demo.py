@@ -46,8 +46,10 @@ def main(config: Config) -> None:
     from touchgoal.episodes.recording import EpisodeSpec, record_with_film
     from touchgoal.episodes.store import EpisodeWriter
     from touchgoal.rewards.goals import Inputs, parse_goal
-    from touchgoal.rewards.report.report import report_all, write_report
+    from touchgoal.rewards.report.report import write_report
+    from touchgoal.rewards.report.summary import metrics_table
     from touchgoal.rewards.reward_model import load_reward_model
+    from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.run_folder import open_run
     from touchgoal.sim_envs.pick_place import PickPlace
 
@@ -67,7 +69,8 @@ def main(config: Config) -> None:
     write_report(curves, out, "curves", model.provenance())
     write_film(out / "episode.mp4", pictures, episode, hz, curves.costs, "distance to goal")
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
-    report_all([curves], out)
+    write_json(out / "metrics.json", {k: m.as_dict() for k, m in curves.metrics().items()})
+    print(metrics_table([curves]))
     print(f"film: {out / 'episode.mp4'}\ncurves: {out / 'curves.png'}\n\n{what_next(out)}")
 
 

@@ -1,18 +1,22 @@
-"""Cost and reward curves of episodes, or of a plain video or folder of images, towards a goal.
+"""Cost and reward curves of episodes, or of plain videos or folders of images, towards a goal.
 
 A goal is: last (the last frame), frame:K, image:PATH, episode:ROOT#K (the end of another episode)
 or text:SENTENCE (how the object feels). Each modality (image, touch, text) takes the first goal that
 applies to it. The cost is the distance to the goal; rewards are -cost, and gamma * Phi' - Phi with
 Phi = -cost (Ng et al. 1999).
+
+What is broken is skipped and listed in skipped.csv; the exit status is 1 only if nothing could be
+measured. The same line with the same --out goes on where an interrupted run stopped.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from pydantic import Field
 
-from touchgoal.runtime.option_types import Positive, checked_dataclass
+from touchgoal.runtime.option_types import Count, CountOrNone, Positive, checked_dataclass
 
 
 @checked_dataclass
@@ -20,15 +24,17 @@ class Config:
     """Options of reward-curves."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """A set of episodes, a video file, or a folder of images."""
+    """A set of episodes; a video file, with NAME_tactile_left.mp4 and so on beside it; a folder of images;
+    or a folder of several of them."""
     goal: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Goal to measure the distance to; may be given several times. Default: last."""
+    """Goal to measure the distance to; may be given several times. Default: last; where failures are
+    among the episodes, the end of another success with the same object."""
     index: tuple[int, ...] = ()
     """Episodes of the set to measure, counted from 0. Default: all."""
     camera: str = "front"
-    """Camera of the episodes: front or wrist."""
+    """Camera of the episodes, or of videos whose name does not say it: front or wrist."""
     fps: Positive | None = None
-    """Frames per second of a folder of images. Default: 20."""
+    """Frames per second of folders of images. Default: 20."""
     encoder: str | None = None
     """Touch encoder: a name (touchgoal list encoders), a folder, or a published Sparsh one. Default:
     the one that ships for the episodes' sensor. Sentences need one that is aligned with texts."""
@@ -41,6 +47,10 @@ class Config:
     gamma: Annotated[float, Field(gt=0, le=1)] = 0.99
     """Discount factor of the potential-based reward gamma * Phi' - Phi, in (0, 1]. Set it to the
     discount factor of the RL algorithm that uses the reward."""
+    plots: CountOrNone = 100
+    """Number of trajectories, from the first, that get a plot of their own."""
+    workers: Count = 2
+    """Number of threads that decode ahead of the encoders."""
     device: str = "cpu"
     """Torch device of the encoders: cpu, cuda or cuda:1."""
     out: Path | None = None
@@ -48,38 +58,56 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Check, embed, measure, and write a plot, a CSV and a JSON for each trajectory."""
-    from touchgoal.rewards.goals import parse_goal
-    from touchgoal.rewards.report.report import report_all, write_report
-    from touchgoal.rewards.reward_model import load_reward_model
-    from touchgoal.rewards.sources import VideoSource, open_source
-    from touchgoal.runtime.progress import track
+    """Check, measure what is not measured yet, and write the reports."""
+    from touchgoal.rewards.default_goal import goals_of
+    from touchgoal.rewards.goals import EpisodeEnd, OwnFrame, assign_goals, parse_goal
+    from touchgoal.rewards.measure import Measurement, write_skipped
+    from touchgoal.rewards.report.frame_table import FRAMES
+    from touchgoal.rewards.report.page import PAGE
+    from touchgoal.rewards.report.report import report_all
+    from touchgoal.rewards.reward_model import RewardModel, load_reward_model
+    from touchgoal.rewards.sources.open_source import open_source
+    from touchgoal.rewards.sources.trajectory import Trajectory
+    from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.run_folder import open_run
 
     with_touch = config.towers is None or config.encoder is not None
     source = open_source(config.source, config.camera, config.index, with_touch, config.fps)
-    if isinstance(source, VideoSource):
+    if source.summary:
         print(source.summary)
-    elif source.path != config.source:
-        print(f"{config.source} is not a set of episodes; measuring the set {source.path}")
-    goals = [parse_goal(text) for text in config.goal or ("last",)]
+    given = [parse_goal(text) for text in config.goal]
+    goals = {} if given else goals_of(source.trajectories)
+    if any(isinstance(goal, EpisodeEnd) for goal in goals.values()):
+        print("failures are among the episodes: the goal is the end of another success, not last")
+    elif OwnFrame() in given and any(t.meta.get("success") is False for t in source.trajectories):
+        print("failures are among the trajectories, and to last each of them ends at cost 0, too")
+    first = given or list(goals.values())[:1]
     model = load_reward_model(
-        source.inputs, goals, config.encoder, config.towers, config.normalizer, config.device
+        source.inputs, first, config.encoder, config.towers, config.normalizer, config.device
     )
     print(model.note)
+
+    def model_of(trajectory: Trajectory) -> RewardModel:
+        if given:
+            return model
+        goal = assign_goals([goals[trajectory.name]], source.inputs.modalities)
+        return replace(model, goal=goal)
+
     out = open_run(config.out, "reward-curves", config)
-    measured = []
-    total = len(source.names)
-    trajectories = track(source.embed(model.embedder), "measuring", "trajectory", total=total)
+    measurement = Measurement(source.trajectories, model_of, out, config.gamma, config.plots)
+    total = len(source.trajectories) + len(source.skipped)
+    if done := len(measurement.records):
+        print(f"{done:,} of {total:,} trajectories are measured in {out}")
     try:
-        for name, trajectory in zip(source.names, trajectories, strict=True):
-            curves = model.curves(trajectory)
-            write_report(curves, out, name, model.provenance(), config.gamma)
-            measured.append(curves)
+        measurement.run(config.workers)
     except KeyboardInterrupt as interruption:
-        interruption.add_note(f"{len(measured)} of {total} trajectories are measured, in {out}")
-        if measured:
-            report_all(measured, out)
+        kept = f"{len(measurement.records)} of {total} trajectories are measured"
+        interruption.add_note(f"{kept}; the same line with --out {out} continues")
         raise
-    report_all(measured, out)
-    print(f"next: plots are in {out}/*.png; train on the reward_ columns of {out}/*.csv")
+    skipped = [*source.skipped, *measurement.skipped]
+    summary = write_skipped(skipped, total, out)
+    if not measurement.records:
+        raise UserError(f"nothing could be measured: {skipped[0].reason}")
+    report_all(measurement.records, out, model.provenance())
+    print(summary)
+    print(f"next: look at {out / PAGE}; train on {out / FRAMES}")

@@ -7,7 +7,7 @@ background of a fingertip (the median of the first 5 frames) and a goal that is 
 trajectory itself (`Curves.same_episode`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from touchgoal.control.features import TACTILE, TRUTH_CONTACT
 from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.touches import contact_per_frame
+from touchgoal.episodes.touches import ContactStream
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
 
 if TYPE_CHECKING:
@@ -129,6 +129,13 @@ def add_fused_curves(
     return dict(single) | fused
 
 
+def main_curve(names: Iterable[str]) -> str:
+    """Return the curve that stands for all: a fused one if there is one, else the first."""
+    listed = list(names)
+    fused = [name for name in listed if name == "fused" or "+" in name]
+    return (fused or listed)[0]
+
+
 def state_reward(cost: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Return r_t = -cost_t."""
     return 0.0 - cost  # no negative zeros in the files
@@ -144,20 +151,36 @@ def potential_reward(cost: Float[np.ndarray, " n"], gamma: float) -> Float[np.nd
     return np.concatenate([np.zeros(1), gamma * potential[1:] - potential[:-1]])
 
 
-def first_contact(episode: Episode) -> Contact:
-    """Return the first contact: the simulator's truth, else detected in the tactile images.
+class ContactSearch:
+    """Search for the first contact over consecutive chunks of an episode.
 
-    Detection compares with the first frames, which must be free of contact.
+    It takes the simulator's truth, else detects contact in the tactile images by comparing with the
+    first frames, which must be free of contact.
     """
-    if TRUTH_CONTACT in episode.frames:
-        return Contact(_first(episode.frames[TRUTH_CONTACT]), "truth")
-    sides = [episode.frames[key] for key in TACTILE if key in episode.frames]
-    if not sides:
-        return Contact(None, "no touch")
-    touching = [contact_per_frame(side) for side in sides]
-    return Contact(_first(np.stack(touching, axis=1)), "detected")
+
+    def __init__(self) -> None:
+        self.contact = Contact(None, "no touch")
+        self._streams: dict[str, ContactStream] = {}
+        self._frames = 0
+
+    def update(self, chunk: Episode) -> Contact:
+        """Search the next frames, at first at least 5; return the first contact so far."""
+        truth = chunk.frames.get(TRUTH_CONTACT)
+        sides = [key for key in TACTILE if key in chunk.frames]
+        if self.contact.frame is None and (truth is not None or sides):
+            touching = truth if truth is not None else self._detect(chunk, sides)
+            frames = np.flatnonzero(touching.any(axis=1))
+            first = self._frames + int(frames[0]) if len(frames) else None
+            self.contact = Contact(first, "detected" if truth is None else "truth")
+        self._frames += len(chunk)
+        return self.contact
+
+    def _detect(self, chunk: Episode, sides: list[str]) -> Bool[np.ndarray, "n sides"]:
+        streams = [self._streams.setdefault(key, ContactStream()) for key in sides]
+        pairs = zip(streams, sides, strict=True)
+        return np.stack([stream.update(chunk.frames[key]) for stream, key in pairs], axis=1)
 
 
-def _first(touching: Bool[np.ndarray, "n sides"]) -> int | None:
-    frames = np.flatnonzero(touching.any(axis=1))
-    return int(frames[0]) if len(frames) else None
+def first_contact(episode: Episode) -> Contact:
+    """Return the first contact of a whole episode, see `ContactSearch`."""
+    return ContactSearch().update(episode)

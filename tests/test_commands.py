@@ -349,13 +349,18 @@ def test_wrong_data_for_an_encoder(
     assert "is marked as a success" in unknown and not out.exists()
 
 
-def test_corrupt_episode_is_named(
+def test_corrupt_episode_is_skipped_and_named(
     episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    broken = tmp_path / "episodes"
+    broken, out = tmp_path / "episodes", tmp_path / "out"
     shutil.copytree(episodes, broken)
-    data = next(broken.rglob("data/**/*.parquet"))
-    data.write_bytes(data.read_bytes()[:1000])
-    out = tmp_path / "out"
-    message = refused(capsys, "reward-curves", broken, "--out", out)
-    assert data.name in message and "repair" in message and not out.exists()
+    data = sorted(broken.rglob("data/**/*.parquet"))
+    data[0].write_bytes(data[0].read_bytes()[:1000])
+    run("reward-curves", broken, "--out", out, "--encoder", "gelsight_mini_surfaces")
+    assert f"1 of 2 skipped, see {out / 'skipped.csv'}" in capsys.readouterr().out
+    [row] = (out / "skipped.csv").read_text().splitlines()[1:]
+    assert row.startswith("episode_000,") and data[0].name in row and "repair" in row
+    assert {p.name for p in out.glob("*.csv")} == {"skipped.csv", "episode_001.csv"}
+    next(broken.rglob("observation.images.front/**/*001.mp4")).unlink()
+    message = refused(capsys, "reward-curves", broken, "--out", tmp_path / "none")
+    assert "nothing could be measured" in message and data[0].name in message

@@ -23,7 +23,6 @@ from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.rewards.curves import Contact, first_contact
 from touchgoal.rewards.distance.embedding_distance import compute_curves, compute_distances
-from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
 from touchgoal.rewards.goals import (
     EpisodeEnd,
@@ -166,7 +165,7 @@ def test_video_has_pictures_alone(embedder: EpisodeEmbedder) -> None:
     frames = recorded().frames[FRONT]
     episode = embedder.embed_episode(recorded(), 20.0, "mine")
     for any_embedder in (embedder, EpisodeEmbedder(PaintTowers(), None)):
-        video = any_embedder.embed_video(frames, 30.0, "a.mp4")
+        video = any_embedder.embed_episode(Episode({FRONT: frames}, "video"), 30.0, "a.mp4")
         goal = choose([OwnFrame()], video.modalities)
         curves = compute_curves(video, any_embedder.embed_goal(goal, video), None)
         assert list(curves.costs) == ["image"] and curves.contact.frame is None
@@ -235,18 +234,14 @@ def test_goals_that_failed_are_tried_again(tmp_path: Path, monkeypatch: pytest.M
     assert found == [("goals-0", 0), ("goals-1", 0), ("goals-0", 2)]
 
 
-def test_an_episode_embedded_in_pieces_is_the_whole(embedder: EpisodeEmbedder) -> None:
-    """Each later piece comes with the first frames and those that the encoder looks back at."""
+def test_an_episode_embedded_in_chunks_is_the_whole(embedder: EpisodeEmbedder) -> None:
     whole = recorded(20)
-    context = [*range(5), *range(12 - embedder.past_frames, 12)]
-    pieces = [
-        embedder.embed_episode(
-            replace(whole, frames={key: v[rows] for key, v in whole.frames.items()}), 20.0, "x"
-        )
-        for rows in (list(range(12)), [*context, *range(12, 20)])
+    chunks = [
+        replace(whole, frames={key: v[rows] for key, v in whole.frames.items()})
+        for rows in (slice(12), slice(12, 13), slice(13, 20))
     ]
-    joined = EmbeddedEpisode.joined(pieces, repeated=len(context))
     once = embedder.embed_episode(whole, 20.0, "x")
+    joined = embedder.embed_chunks(chunks, 20.0, "x")
     assert joined.pictures() == pytest.approx(once.pictures(), abs=1e-6)
     assert joined.touches() == pytest.approx(once.touches(), abs=1e-5)
     assert (joined.contact, len(joined)) == (once.contact, 20)

@@ -84,14 +84,6 @@ class EmbeddedEpisode:
             readings=None if self.readings is None else self.readings.take(rows),
         )
 
-    @classmethod
-    def joined(cls, pieces: "Sequence[EmbeddedEpisode]", repeated: int) -> "EmbeddedEpisode":
-        """Return consecutive pieces of one trajectory as one.
-
-        The first `repeated` frames of every piece but the first were embedded for context only.
-        """
-        return pieces[0].extended([piece.take(slice(repeated, None)) for piece in pieces[1:]])
-
     def extended(self, later: "Sequence[EmbeddedEpisode]") -> "EmbeddedEpisode":
         """Return this trajectory with consecutive later pieces of itself behind it."""
         pieces = (self, *later)
@@ -117,7 +109,6 @@ class EmbeddedGoal:
     image: Float32[np.ndarray, "g d"] | None = None
     touch: Float32[np.ndarray, "sides g k"] | None = None
     text: Float32[np.ndarray, "g k"] | None = None
-    text_baseline: Float32[np.ndarray, "b k"] | None = None  # of the sentence against it, if any
     cameras: Mapping[str, CameraFeatures] = field(default_factory=dict)
     readings: ContactReadings | None = None
 

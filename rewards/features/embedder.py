@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,16 +18,13 @@ from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import MapTowers, Towers
 from touchgoal.episodes.schema import Episode, is_camera
 from touchgoal.episodes.touches import touch_background
-from touchgoal.rewards.curves import Contact, first_contact
+from touchgoal.rewards.curves import ContactSearch
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
 from touchgoal.rewards.features.embedded import CameraFeatures, EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.features.feature_stream import FeatureStream, Frames
-from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.goals import (
-    Bank,
     EpisodeEnd,
     Goal,
-    GoalFile,
     GoalPicture,
     GoalSpec,
     OwnFrame,
@@ -70,7 +68,6 @@ class EpisodeEmbedder:
         self.knows_words = self._aligned is not None  # touch can be compared with sentences
         self.camera = camera
         self.with_parts = with_parts
-        self._ends: dict[Bank | GoalFile, SuccessfulEnds] = {}
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
         self._pictures_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
         self.made_with = self._pictures_with  # of episodes with touch, if there is an encoder
@@ -90,46 +87,42 @@ class EpisodeEmbedder:
         return 0 if self.encoder is None else max(self.encoder.offsets)
 
     def embed_episode(
-        self,
-        episode: Episode,
-        fps: float,
-        source: str,
-        descriptions: bool = False,
-        contact: Contact | None = None,
+        self, episode: Episode, fps: float, source: str, descriptions: bool = False
     ) -> EmbeddedEpisode:
         """Embed an episode's cameras and fingertips; on request the sentences about it, too.
 
-        The first contact is looked for unless it is given. UserError: the episode lacks the camera,
-        starts in contact, or has descriptions that are no list of sentences.
+        UserError: the episode lacks the camera, starts in contact, or has descriptions that are no
+        list of sentences.
         """
-        truth = episode.frames.get(TRUTH_CONTACT)
-        if self._sides(episode.frames) and truth is not None and truth[:START_FRAMES].any():
+        return self.embed_chunks([episode], fps, source, descriptions)
+
+    def embed_chunks(
+        self, chunks: Iterable[Episode], fps: float, source: str, descriptions: bool = False
+    ) -> EmbeddedEpisode:
+        """Embed consecutive chunks of one episode, as `embed_episode` embeds it in one go.
+
+        The first chunk has at least 5 frames, unless it is the whole episode.
+        """
+        following = iter(chunks)
+        first = next(following)
+        truth = first.frames.get(TRUTH_CONTACT)
+        if self._sides(first.frames) and truth is not None and truth[:START_FRAMES].any():
             raise UserError(
                 f"{source} starts in contact, so its fingertips have no background; record it "
                 f"with {START_FRAMES} frames before the first touch"
             )
-        success = episode.meta.get("success")
-        stream = self.stream(episode.frames, fps, source)
+        stream, search = self.stream(first.frames, fps, source), ContactSearch()
+        pieces = []
+        for chunk in chain([first], following):
+            search.update(chunk)
+            pieces.append(stream.embed(chunk.frames))
+        success = first.meta.get("success")
         return replace(
-            stream.embed(episode.frames),
-            contact=contact or first_contact(episode),
-            descriptions=self._embed_descriptions(episode, source) if descriptions else None,
-            object=str(episode.meta.get("object", "")),
+            pieces[0].extended(pieces[1:]),
+            contact=search.contact,
+            descriptions=self._embed_descriptions(first, source) if descriptions else None,
+            object=str(first.meta.get("object", "")),
             success=None if success is None else bool(success),
-        )
-
-    def embed_video(
-        self, frames: UInt8[np.ndarray, "n h w 3"], fps: float, source: str
-    ) -> EmbeddedEpisode:
-        """Embed a plain video or folder of images: images alone, of an unknown camera."""
-        camera = self.embed_camera(frames)
-        return EmbeddedEpisode(
-            source=source,
-            fps=fps,
-            contact=Contact(None, "no touch"),
-            made_with=replace(self._pictures_with, camera=""),
-            image=camera.pooled,
-            cameras={FRONT: camera} if self.with_parts else {},
         )
 
     def stream(self, first: Frames, fps: float, source: str) -> "FeatureStream":
@@ -167,9 +160,7 @@ class EpisodeEmbedder:
         if goal.tactile is not None:
             embedded = replace(embedded, **self._goal_touches(goal.tactile, own))
         if goal.text is not None:
-            sentences = [s for s in (goal.text.text, goal.text.baseline) if s]
-            text = self.embed_sentences(sentences)
-            embedded = replace(embedded, text=text[:1], text_baseline=text[1:])
+            embedded = replace(embedded, text=self.embed_sentences([goal.text.text]))
         return embedded
 
     def embed_camera(self, frames: UInt8[np.ndarray, "n h w 3"]) -> CameraFeatures:
@@ -211,9 +202,6 @@ class EpisodeEmbedder:
         if isinstance(spec, GoalPicture):
             cameras = {main: self.embed_camera(spec.read())}
             return {"image": cameras[main].pooled, "cameras": cameras}
-        if isinstance(spec, Bank | GoalFile):
-            end = self._successful_ends(spec, own).of_object(own.object, str(spec))
-            return {"image": end.image, "cameras": end.cameras}
         if isinstance(spec, EpisodeEnd):
             frames = spec.read(tuple(own.cameras) or (main,)).frames
             cameras = {k: self.embed_camera(v[-1:]) for k, v in frames.items() if is_camera(k)}
@@ -225,8 +213,6 @@ class EpisodeEmbedder:
         """Return the fields of an `EmbeddedGoal` that the goal of touch sets."""
         if isinstance(spec, OwnFrame):
             end = own.take(_one(frame_index(spec, len(own), own.source)))
-        elif isinstance(spec, Bank | GoalFile):
-            end = self._successful_ends(spec, own).of_object(own.object, str(spec))
         elif isinstance(spec, EpisodeEnd):
             read = spec.read(own.sides)
             end = self.embed_episode(replace(read, meta={}), own.fps, str(spec))
@@ -238,25 +224,6 @@ class EpisodeEmbedder:
             }
             end = self.stream(frames, own.fps, str(spec)).embed(frames).take(_one(START_FRAMES))
         return {"touch": end.touch, "readings": end.readings}
-
-    def _successful_ends(self, spec: Bank | GoalFile, own: EmbeddedEpisode) -> SuccessfulEnds:
-        """Return the ends of a bank, embedded once; UserError if they were embedded otherwise."""
-        if spec not in self._ends:
-            if isinstance(spec, GoalFile):
-                ends = SuccessfulEnds.load(spec.path)
-            else:
-                wanted = (*own.cameras, *((self.camera,) if self.camera else ()), *own.sides)
-                embedded = [self._embed_end(end, wanted, own.fps) for end in spec.ends()]
-                ends = SuccessfulEnds.of(embedded)
-            self._ends[spec] = ends
-        ends = self._ends[spec]
-        if (reason := ends.frames.made_with.mismatch(own.made_with)) is not None:
-            raise UserError(f"goal '{spec}' does not fit {own.source}: {reason}")
-        return ends
-
-    def _embed_end(self, end: EpisodeEnd, keys: Sequence[str], fps: float) -> EmbeddedEpisode:
-        """Return the first frames and the end of an episode, embedded."""
-        return self.embed_episode(end.read(tuple(dict.fromkeys(keys))), fps, str(end))
 
     def _embed_descriptions(
         self, episode: Episode, source: str

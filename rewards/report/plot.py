@@ -1,24 +1,17 @@
 """Plots of cost and reward curves, one panel under another."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from touchgoal.episodes.film import COLORS
-from touchgoal.rewards.curves import Curves
+from touchgoal.episodes.film import BLACK, COLORS
+from touchgoal.rewards.curves import Curves, main_curve
 
-COLOR: dict[str, str] = dict(  # for the colour-blind, too; the dashes distinguish them in grey
-    zip(("image", "tactile", "text", "image+tactile", "image+text"), COLORS, strict=True)
-)
-DASHES = {
-    "image": (0, (5, 2)),
-    "tactile": (0, (1.5, 1.5)),
-    "text": (0, (5, 1.5, 1.5, 1.5)),
-    "image+tactile": "-",
-    "image+text": "-",
-}
+_DASHES = ((0, (5, 2)), (0, (1.5, 1.5)), (0, (5, 1.5, 1.5, 1.5)), "-", (0, (3, 1)), (0, (8, 2)))
+_SINGLE = tuple(color for color in COLORS if color != BLACK)
 _SIZE = (12.0, 10.0)  # inches, at 100 pixels an inch
 _PANELS = ((0.53, 0.345), (0.275, 0.17), (0.06, 0.15))  # bottom and height of each panel
 _LABEL_GAP = 0.06  # least distance between two curve labels, share of the first panel's height
@@ -38,14 +31,13 @@ def draw(curves: Curves, gamma: float) -> Figure:
         (f"potential-based\nreward, γ = {gamma:g}", curves.potential_rewards(gamma)),
     )
     fps, contact = curves.fps, curves.contact
+    styles = line_styles(list(curves.costs))
     figure = Figure(figsize=_SIZE, dpi=100)
     length = len(curves)
     for k, ((label, lines), (bottom, height)) in enumerate(zip(panels, _PANELS, strict=True)):
         axes = figure.add_axes((0.095, bottom, 0.725, height))
         for name, line in lines.items():
-            width = 2.6 if "+" in name else 1.8
-            style = {"color": _color(name), "linestyle": DASHES.get(name, "-"), "linewidth": width}
-            axes.plot(np.arange(length) / fps, line, **style)
+            axes.plot(np.arange(length) / fps, line, **styles[name])
         _frame_axes(axes, label, (length - 1) / fps)
         if k == 0:
             _frame_costs(axes, bool(curves.normalised))
@@ -53,7 +45,7 @@ def draw(curves: Curves, gamma: float) -> Figure:
             name = f"contact ({contact.label_source})" if k == 0 else ""
             _mark_contact(axes, contact.frame / fps, name)
         if k < 2:  # in the last panel all curves end near 0: colours and dashes distinguish them
-            _label_lines(axes, lines, _LABEL_GAP * _PANELS[0][1] / height)
+            _label_lines(axes, lines, styles, _LABEL_GAP * _PANELS[0][1] / height)
             axes.tick_params(labelbottom=k == 0)
     figure.axes[-1].set_xlabel("time (s)", fontsize=12)
     goals = " and ".join(dict.fromkeys(curves.goal.values()))
@@ -63,9 +55,22 @@ def draw(curves: Curves, gamma: float) -> Figure:
     return figure
 
 
-def _color(name: str) -> str:
-    """Return the colour of a curve: its own, or grey for a part among others."""
-    return COLOR.get(name, "0.2" if name == "fused" else "0.65")
+def line_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return colour, dashes and width of each curve; the main one is a thick black line.
+
+    Colours are for the colour-blind, too; the dashes distinguish them in grey.
+    """
+    main = main_curve(names) if len(names) > 1 else ""
+    single = [name for name in names if name != main]
+    styles: dict[str, dict[str, Any]] = {
+        name: {
+            "color": _SINGLE[k % len(_SINGLE)],
+            "linestyle": _DASHES[k % len(_DASHES)],
+            "linewidth": 1.8,
+        }
+        for k, name in enumerate(single)
+    }
+    return styles | {main: {"color": BLACK, "linestyle": "-", "linewidth": 2.6}}
 
 
 def _frame_axes(axes: Axes, label: str, end: float) -> None:
@@ -115,13 +120,18 @@ def _mark_contact(axes: Axes, time: float, name: str) -> None:
     )
 
 
-def _label_lines(axes: Axes, values: Mapping[str, np.ndarray], gap: float) -> None:
+def _label_lines(
+    axes: Axes,
+    values: Mapping[str, np.ndarray],
+    styles: Mapping[str, Mapping[str, Any]],
+    gap: float,
+) -> None:
     """Name each line at its right end, outside the axes, moved apart where ends meet."""
     low, high = axes.get_ylim()
     names = sorted(values, key=lambda name: values[name][-1])
     ends = np.array([(values[name][-1] - low) / (high - low) for name in names])
     for name, end, height in zip(names, ends, _spread_labels(ends, gap), strict=True):
-        color = _color(name)
+        color, width = styles[name]["color"], styles[name]["linewidth"]
         axes.annotate(
             name,
             (1, end),
@@ -130,7 +140,7 @@ def _label_lines(axes: Axes, values: Mapping[str, np.ndarray], gap: float) -> No
             textcoords="axes fraction",
             va="center",
             fontsize=12.5,
-            fontweight="bold" if "+" in name else "normal",
+            fontweight="bold" if width > 2 else "normal",
             color=color,
             annotation_clip=False,
             arrowprops={

@@ -1,4 +1,4 @@
-"""Report of one trajectory: a plot, a CSV and a JSON; and the table of all."""
+"""Report of one trajectory (a plot, a CSV and a JSON), and of all that were measured."""
 
 import csv
 import io
@@ -11,38 +11,64 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from touchgoal.rewards.curves import GAMMA, Curves
+from touchgoal.rewards.report.frame_table import PROGRESS, write_frames, write_progress
+from touchgoal.rewards.report.outcome_table import outcome_table
+from touchgoal.rewards.report.page import write_pages
+from touchgoal.rewards.report.record import Facts, columns_of, load_facts
 from touchgoal.rewards.report.summary import metrics_table
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.json_file import write_json
 
 
 def write_report(
-    curves: Curves, folder: Path, name: str, provenance: Mapping[str, Any], gamma: float = GAMMA
+    curves: Curves,
+    folder: Path,
+    name: str,
+    provenance: Mapping[str, Any],
+    gamma: float = GAMMA,
+    plot: bool = True,
 ) -> dict[str, Path]:
-    """Write NAME.png, NAME.csv and NAME.json, each atomically; return the paths by kind.
+    """Write NAME.csv, NAME.json and, on request, NAME.png, each atomically; return the paths by kind.
 
     The JSON also holds what the curves were made with (encoder, towers, command).
     """
-    png = io.BytesIO()
-    FigureCanvasAgg(curves.plot(gamma)).print_png(png, metadata={"Software": None})
     contents = {
-        "png": png.getvalue(),
         "csv": curves_csv(curves, gamma).encode(),
         "json": (json.dumps(report_json(curves, provenance, gamma), indent=2) + "\n").encode(),
     }
+    if plot:
+        png = io.BytesIO()
+        FigureCanvasAgg(curves.plot(gamma)).print_png(png, metadata={"Software": None})
+        contents["png"] = png.getvalue()
     paths = {kind: folder / f"{name}.{kind}" for kind in contents}
     for kind, path in paths.items():
         write_file(path, contents[kind])
     return paths
 
 
-def report_all(curves: Sequence[Curves], out: Path) -> None:
-    """Print the table of all curves and write their metrics to metrics.json."""
-    write_json(
-        out / "metrics.json",
-        [{"source": c.source, **{k: m.as_dict() for k, m in c.metrics().items()}} for c in curves],
-    )
-    print(metrics_table(curves))
+def report_all(records: Sequence[Path], out: Path, provenance: Mapping[str, Any]) -> None:
+    """Write the reports of all records: metrics, tables for LeRobot, pages; print the tables."""
+    facts = [load_facts(path) for path in records]
+    write_metrics(facts, out)
+    write_frames(records, facts, out, provenance)
+    if facts[0].normalised:
+        write_progress(records, out)
+    tables = [metrics_table(facts)]
+    if any(one.outcome for one in facts):
+        tables.append(outcome_table(facts))
+    page = write_pages(records, facts, out, tables[1:])
+    print("\n\n".join(tables))
+    if not facts[0].normalised:
+        print(f"no {PROGRESS}: raw distances are no progress; normalise them (fit-normalizer)")
+    print(f"page: {page}")
+
+
+def write_metrics(facts: Sequence[Facts], out: Path) -> None:
+    """Write the metrics of every trajectory to metrics.json."""
+    rows = [
+        {"source": f.source, "object": f.object, "outcome": f.outcome, **f.measured} for f in facts
+    ]
+    write_json(out / "metrics.json", rows)
 
 
 def report_json(
@@ -79,16 +105,7 @@ def curves_csv(curves: Curves, gamma: float = GAMMA) -> str:
     Columns: frame, time (s); for every curve `cost_`, `reward_` (-cost) and `potential_reward_`
     (gamma * Phi(frame) - Phi(frame before)); `cosine_distance_` of every single modality.
     """
-    columns = {
-        f"{kind}_{name}": values
-        for kind, group in (
-            ("cost", curves.costs),
-            ("reward", curves.rewards),
-            ("potential_reward", curves.potential_rewards(gamma)),
-            ("cosine_distance", curves.raw),
-        )
-        for name, values in group.items()
-    }
+    columns = columns_of(curves, gamma)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["frame", "time_s", *columns])

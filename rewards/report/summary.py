@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from statistics import mean, median_low
 
 from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.report.record import Facts
 
-_COLUMNS = {
+COLUMNS = {
     "first": ("start", "median cost of the first 5 frames"),
     "last": ("end", "cost of the last frame"),
     "half at": ("t_drop_50", "first frame by which half of that fall has happened"),
@@ -28,7 +29,7 @@ _COLUMNS = {
 """Header -> field of `CurveMetrics`, and line of the legend."""
 
 
-def metrics_table(curves: Sequence[Curves], legend: bool = True) -> str:
+def metrics_table(curves: Sequence[Curves] | Sequence[Facts], legend: bool = True) -> str:
     """Return a table with a row for each kind of curve, and the meaning of its columns.
 
     Costs and correlations are means over the episodes; frames and counts are medians (the lower one
@@ -37,10 +38,10 @@ def metrics_table(curves: Sequence[Curves], legend: bool = True) -> str:
     """
     metrics = [c.metrics() for c in curves]
     names = list(dict.fromkeys(name for m in metrics for name in m))
-    rows = [["curve", *_COLUMNS]]
+    rows = [["curve", *COLUMNS]]
     for name in names:
         some = [m[name] for m in metrics if name in m]
-        rows.append([name, *(_cell([getattr(m, f) for m in some]) for f, _ in _COLUMNS.values())])
+        rows.append([name, *(_cell([getattr(m, f) for m in some]) for f, _ in COLUMNS.values())])
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     n = len(curves)
     lines = [f"{n} {'trajectory' if n == 1 else 'trajectories'}; cost: {curves[0].unit}"]
@@ -50,7 +51,7 @@ def metrics_table(curves: Sequence[Curves], legend: bool = True) -> str:
         cells = (f"{cell:>{width + 2}}" for cell, width in zip(row[1:], widths[1:], strict=True))
         lines.append(f"{row[0]:<{widths[0]}}" + "".join(cells))
     if legend:
-        lines += [f"  {header:<10}{legend}" for header, (_, legend) in _COLUMNS.items()]
+        lines += [f"  {header:<10}{legend}" for header, (_, legend) in COLUMNS.items()]
         lines.append("  -         undefined: the cost does not fall, or there is no contact")
     return "\n".join(lines)
 

@@ -1,0 +1,120 @@
+"""Measure every trajectory of a source once: what is broken is skipped, what is measured stays."""
+
+import csv
+import hashlib
+import io
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from touchgoal import __version__
+from touchgoal.episodes.schema import Episode
+from touchgoal.rewards.report.record import record_of
+from touchgoal.rewards.report.report import write_report
+from touchgoal.rewards.report.thumbnails import Thumbnails
+from touchgoal.rewards.reward_model import RewardModel
+from touchgoal.rewards.sources.read_ahead import read_ahead
+from touchgoal.rewards.sources.trajectory import Skipped, Trajectory
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import progress_bar
+
+SKIPPED = "skipped.csv"
+_RECORDS = "measured"
+
+
+class Measurement:
+    """The measurement of some trajectories into the folder of a run."""
+
+    def __init__(
+        self,
+        trajectories: Sequence[Trajectory],
+        model_of: Callable[[Trajectory], RewardModel],
+        out: Path,
+        gamma: float,
+        plots: int,
+    ) -> None:
+        """Find out what is measured already.
+
+        Args:
+            model_of: the reward model of a trajectory.
+            gamma: discount factor of the potential-based reward.
+            plots: number of trajectories, from the first, that get a plot.
+        """
+        self._out, self._gamma = out, gamma
+        self._models = {t.name: model_of(t) for t in trajectories}
+        self._plotted = {t.name for t in trajectories[:plots]}
+        self._paths = {t.name: self._path(t) for t in trajectories}
+        self.missing = [t for t in trajectories if not self._paths[t.name].is_file()]
+        self.skipped: list[Skipped] = []
+
+    @property
+    def records(self) -> list[Path]:
+        """Records of the measured trajectories, in the order of the source."""
+        return [path for path in self._paths.values() if path.is_file()]
+
+    def run(self, workers: int) -> None:
+        """Measure what is missing; add what cannot be read to `skipped`.
+
+        Each trajectory is on disk when the next one begins. `workers` threads read ahead.
+        """
+        done = 0
+        with progress_bar("measuring", sum(t.length for t in self.missing), "frame") as bar:
+            for trajectory, chunks in read_ahead(self.missing, workers):
+                try:
+                    self._measure(trajectory, _counted(chunks, bar))
+                except UserError as error:
+                    self.skipped.append(Skipped(trajectory.name, str(error)))
+                done += trajectory.length
+                bar.update(done - bar.n)
+
+    def _measure(self, trajectory: Trajectory, chunks: Iterable[Episode]) -> None:
+        model, name = self._models[trajectory.name], trajectory.name
+        thumbnails = Thumbnails(trajectory.length)
+        embedded = model.embedder.embed_chunks(
+            thumbnails.collect(chunks), trajectory.fps, trajectory.source
+        )
+        curves = model.curves(embedded)
+        plot = name in self._plotted
+        write_report(curves, self._out, name, model.provenance(), self._gamma, plot)
+        path = self._paths[name]
+        for stale in path.parent.glob(f"{name}.*.npz"):
+            stale.unlink()
+        record_of(curves, trajectory, thumbnails, self._gamma).save(path)
+
+    def _path(self, trajectory: Trajectory) -> Path:
+        """Return the path of a record, which names the recording and what it was measured with."""
+        model = self._models[trajectory.name]
+        made_of = [
+            __version__,
+            trajectory.checksum(),
+            model.provenance(),
+            model.goal.as_dict(),
+            repr(model.normalizer),
+            [weights.sum().item() for weights in model.value.parameters()] if model.value else [],
+            self._gamma,
+        ]
+        digest = hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:12]
+        return self._out / _RECORDS / f"{trajectory.name}.{digest}.npz"
+
+
+def write_skipped(skipped: Sequence[Skipped], total: int, out: Path) -> str:
+    """Write skipped.csv and return a line for people; without any, remove the file."""
+    path = out / SKIPPED
+    if not skipped:
+        path.unlink(missing_ok=True)
+        return f"{total:,} measured"
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["name", "reason"])
+    writer.writerows((one.name, one.reason) for one in skipped)
+    write_file(path, text.getvalue().encode())
+    return f"{len(skipped):,} of {total:,} skipped, see {path}"
+
+
+def _counted(chunks: Iterable[Episode], bar: Any) -> Iterator[Episode]:
+    """Count the frames of a chunk as done when the next one is asked for."""
+    for chunk in chunks:
+        yield chunk
+        bar.update(len(chunk))

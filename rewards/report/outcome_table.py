@@ -1,0 +1,49 @@
+"""Table of last costs by outcome, and how well they tell success from failure."""
+
+from collections.abc import Sequence
+from statistics import mean
+
+from scipy.stats import mannwhitneyu
+
+from touchgoal.rewards.report.record import Facts
+
+_TITLE = "last cost by outcome, goals from other trajectories"
+
+
+def outcome_table(facts: Sequence[Facts]) -> str:
+    """Return a table, its title first, with a row a curve: mean last cost of each outcome, and the AUC.
+
+    The AUC is the share of pairs of a failure and a success in which the failure ends at the higher
+    cost, a tie counting half; a dash where one of the two is missing. Trajectories whose goal is a frame
+    of their own are left out: they end near 0 whatever happened.
+    """
+    facts = [f for f in facts if not f.own_goal]
+    if not facts:
+        return f"{_TITLE}\nnone: every goal is a frame of the trajectory itself"
+    outcomes = sorted({f.outcome for f in facts}, key=lambda name: (name != "success", name))
+    curves = list(dict.fromkeys(name for f in facts for name in f.measured))
+    rows = [["curve", *(name or "unknown" for name in outcomes), "AUC"]]
+    rows.append(["trajectories", *(str(sum(f.outcome == o for f in facts)) for o in outcomes), ""])
+    for curve in curves:
+        last = [(f, f.measured[curve]["end"]) for f in facts if curve in f.measured]
+        by_outcome = [[end for f, end in last if f.outcome == o] for o in outcomes]
+        cells = [f"{mean(ends):.2f}" if ends else "-" for ends in by_outcome]
+        failures, successes = ([end for f, end in last if f.success is s] for s in (False, True))
+        rows.append([curve, *cells, _auc(failures, successes)])
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = [
+        f"{row[0]:<{widths[0]}}"
+        + "".join(f"{cell:>{width + 2}}" for cell, width in zip(row[1:], widths[1:], strict=True))
+        for row in rows
+    ]
+    legend = (
+        "  AUC       share of (failure, success) pairs in which the failure ends at the higher cost"
+    )
+    return "\n".join([_TITLE, *lines, legend])
+
+
+def _auc(failures: Sequence[float], successes: Sequence[float]) -> str:
+    if not failures or not successes:
+        return "-"
+    above = mannwhitneyu(failures, successes).statistic
+    return f"{above / (len(failures) * len(successes)):.2f}"

@@ -1,0 +1,138 @@
+"""Record of one measured trajectory: all that reports are made from, in one file.
+
+A measurement that goes on after an interruption reads it instead of measuring again, so that its reports
+are those of an uninterrupted one.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.metrics import CurveMetrics, find_peaks
+from touchgoal.rewards.report.thumbnails import Thumbnails
+from touchgoal.rewards.sources.trajectory import Trajectory
+from touchgoal.runtime.atomic_write import atomic_write
+
+COST, REWARD, POTENTIAL, RAW = "cost_", "reward_", "potential_reward_", "cosine_distance_"
+"""Beginnings of the names of columns."""
+_COLUMN, _SHEET = "column/", "sheet/"
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Everything about a measured trajectory but its values a frame and its pictures."""
+
+    name: str  # file name of its reports
+    source: str  # name for people
+    index: int  # number within the source
+    offset: int  # number of frames of the source before it
+    frames: int
+    fps: float  # frames per second
+    unit: str  # axis label of the costs
+    normalised: bool  # whether a cost of 1 is the usual start and 0 the usual end
+    goal: dict[str, str]  # by modality, in the form that a user writes
+    own_goal: bool  # whether a goal is a frame of the trajectory itself
+    contact: int | None  # first frame in contact
+    contact_source: str  # see Contact.label_source
+    object: str  # "" if unknown
+    outcome: str  # "success", a kind of failure, or "" if unknown
+    success: bool | None  # None if unknown
+    measured: dict[str, dict[str, Any]]  # metrics of each cost curve, see CurveMetrics
+    peaks: dict[str, list[int]]  # frames of the bumps of each cost curve
+    shown: list[int]  # frames that the pictures show
+    columns: list[str]  # names of the values a frame
+
+    def metrics(self) -> dict[str, CurveMetrics]:
+        """Return the metrics of each cost curve."""
+        return {name: CurveMetrics(**values) for name, values in self.measured.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A measured trajectory."""
+
+    facts: Facts
+    columns: dict[str, Float[np.ndarray, " n"]]  # values a frame
+    sheets: dict[str, UInt8[np.ndarray, " bytes"]]  # JPEG of each camera and fingertip
+
+    @property
+    def costs(self) -> dict[str, Float[np.ndarray, " n"]]:
+        """Cost curves by name."""
+        return {k.removeprefix(COST): v for k, v in self.columns.items() if k.startswith(COST)}
+
+    def save(self, path: Path) -> None:
+        """Write the record atomically."""
+        arrays = {f"{_COLUMN}{key}": values for key, values in self.columns.items()}
+        arrays |= {f"{_SHEET}{key}": sheet for key, sheet in self.sheets.items()}
+        facts = np.array(json.dumps(asdict(self.facts)))
+        with atomic_write(path) as unfinished, unfinished.open("wb") as file:
+            np.savez_compressed(file, facts=facts, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> "Record":
+        """Read a record that `save` wrote."""
+        with np.load(path) as file:
+            facts = Facts(**json.loads(str(file["facts"])))
+            columns, sheets = (
+                {key.removeprefix(kind): file[key] for key in file.files if key.startswith(kind)}
+                for kind in (_COLUMN, _SHEET)
+            )
+        return cls(facts, columns, sheets)
+
+
+def load_facts(path: Path) -> Facts:
+    """Read the facts of a record alone."""
+    with np.load(path) as file:
+        return Facts(**json.loads(str(file["facts"])))
+
+
+def record_of(
+    curves: Curves, trajectory: Trajectory, thumbnails: Thumbnails, gamma: float
+) -> Record:
+    """Return the record of a measured trajectory."""
+    meta, metrics = trajectory.meta, curves.metrics()
+    success = meta.get("success")
+    columns = columns_of(curves, gamma)
+    facts = Facts(
+        name=trajectory.name,
+        source=curves.source,
+        index=trajectory.index,
+        offset=trajectory.offset,
+        frames=len(curves),
+        fps=float(curves.fps),
+        unit=curves.unit,
+        normalised=bool(curves.normalised),
+        goal=dict(curves.goal),
+        own_goal=bool(curves.same_episode),
+        contact=curves.contact.frame,
+        contact_source=curves.contact.label_source,
+        object=str(meta.get("object", "")),
+        outcome=str(meta.get("outcome") or {None: "", True: "success"}.get(success, "failure")),
+        success=None if success is None else bool(success),
+        measured={name: m.as_dict() for name, m in metrics.items()},
+        peaks={n: find_peaks(c, metrics[n].eps).tolist() for n, c in curves.costs.items()},
+        shown=thumbnails.shown,
+        columns=list(columns),
+    )
+    return Record(facts, columns, thumbnails.sheets())
+
+
+def columns_of(curves: Curves, gamma: float) -> dict[str, Float[np.ndarray, " n"]]:
+    """Return all values a frame: costs, both forms of reward, raw distances."""
+    groups: dict[str, Mapping[str, np.ndarray]] = {
+        COST: curves.costs,
+        REWARD: curves.rewards,
+        POTENTIAL: curves.potential_rewards(gamma),
+        RAW: curves.raw,
+    }
+    return {
+        f"{kind}{name}": values.astype(np.float64)
+        for kind, group in groups.items()
+        for name, values in group.items()
+    }

@@ -1,0 +1,148 @@
+"""Episodes of a set as trajectories."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+
+import numpy as np
+
+from touchgoal.control.features import CAMERAS, TACTILE, TRUTH_CONTACT
+from touchgoal.episodes.schema import Episode, MetaValue, is_image
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.touches import check_fingertips
+from touchgoal.rewards.distance.normalizer import scene_of
+from touchgoal.rewards.features.embedder import missing_camera
+from touchgoal.rewards.goals import Inputs
+from touchgoal.rewards.sources.trajectory import Skipped, Source, frames_per_chunk
+from touchgoal.runtime.errors import UserError
+
+_LOOKED_AT = 8  # episodes whose first frames are checked before any work
+
+
+@dataclass(frozen=True)
+class EpisodeTrajectory:
+    """One episode of a set."""
+
+    episodes: EpisodeSet
+    index: int
+    offset: int
+    keys: tuple[str, ...]  # the features that are read
+
+    @property
+    def name(self) -> str:
+        """See Trajectory."""
+        return f"episode_{self.index:03d}"
+
+    @property
+    def source(self) -> str:
+        """See Trajectory."""
+        return f"{self.episodes.root.name}#{self.index}"
+
+    @property
+    def length(self) -> int:
+        """See Trajectory."""
+        return self.episodes.lengths[self.index]
+
+    @property
+    def fps(self) -> float:
+        """See Trajectory."""
+        return self.episodes.fps
+
+    @property
+    def meta(self) -> Mapping[str, MetaValue]:
+        """See Trajectory."""
+        return self.episodes.meta(self.index)
+
+    def checksum(self) -> str:
+        """See Trajectory."""
+        return self.episodes.episode_checksum(self.index)
+
+    def chunks(self) -> Iterator[Episode]:
+        """See Trajectory."""
+        shapes = [self.episodes.features[key]["shape"] for key in self.keys if is_image(key)]
+        size = frames_per_chunk(sum(int(np.prod(shape)) for shape in shapes))
+        for start in range(0, self.length, size):
+            frames = range(start, min(start + size, self.length))
+            yield self.episodes.read(self.index, self.keys, frames)
+
+
+def open_episodes(root: Path, camera: str, index: Sequence[int], with_touch: bool) -> Source:
+    """Open chosen episodes of a set, all of them by default.
+
+    UserError: no such camera or episode, mixed sensors, fingertips that are not the sensor's or
+    change places, or no episode left that can be measured.
+    """
+    episodes = EpisodeSet(root, complete=False)
+    _check_index(episodes, index)
+    chosen = list(index or range(len(episodes)))
+    touch = tuple(key for key in TACTILE if with_touch and key in episodes.features)
+    _check_camera(episodes, camera, bool(touch))
+    _check_sensors(episodes, chosen)
+    cameras = tuple(key for key in CAMERAS if key in episodes.features)
+    keys = [key for key in (*cameras, *touch, TRUTH_CONTACT) if key in episodes.features]
+    tasks = {episodes.task(i) for i in chosen}
+    if touch:
+        seen = {chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)}
+        if readable := [i for i in sorted(seen) if _reads(episodes, i, touch)]:
+            check_fingertips(episodes, readable)
+    offsets = [0, *accumulate(episodes.lengths)]
+    found = [EpisodeTrajectory(episodes, i, offsets[i], tuple(keys)) for i in chosen]
+    short = [
+        Skipped(t.name, f"{t.source} has one frame: a curve needs at least 2")
+        for t in found
+        if t.length < 2
+    ]
+    long = [t for t in found if t.length > 1]
+    if not long:
+        raise UserError(short[0].reason)
+    shortest = min(long, key=lambda t: t.length)
+    inputs = Inputs(
+        name=shortest.source,
+        camera=camera if camera in episodes.features else None,
+        sides=touch,
+        sensor=next(iter(_sensors(episodes, chosen)), None),
+        scene=scene_of(episodes.features),
+        length=shortest.length,
+        cameras=cameras,
+        task=next(iter(tasks)) if len(tasks) == 1 else "",
+    )
+    return Source(inputs, long, short)
+
+
+def _check_index(episodes: EpisodeSet, index: Sequence[int]) -> None:
+    root = episodes.root
+    for i in index:
+        if not 0 <= i < len(episodes):
+            raise UserError(f"{root} has no episode {i}; it has 0 to {len(episodes) - 1}")
+        if index.count(i) > 1:
+            raise UserError(f"--index names episode {i} {index.count(i)} times: name it once")
+    if not len(episodes):
+        raise UserError(f"{root} has no episodes")
+
+
+def _check_camera(episodes: EpisodeSet, camera: str, touch: bool) -> None:
+    cameras = [key for key in CAMERAS if key in episodes.features]
+    if camera not in cameras and (cameras or not touch):
+        raise UserError(missing_camera(str(episodes.root), camera, cameras))
+
+
+def _check_sensors(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
+    if len(sensors := _sensors(episodes, chosen)) > 1:
+        raise UserError(
+            f"{episodes.root} mixes the sensors {', '.join(sorted(sensors))}: choose --index"
+        )
+
+
+def _sensors(episodes: EpisodeSet, chosen: Sequence[int]) -> set[str]:
+    metas = [episodes.meta(i) for i in chosen]
+    return {str(meta["sensor"]) for meta in metas if meta.get("sensor")}
+
+
+def _reads(episodes: EpisodeSet, i: int, keys: Sequence[str]) -> bool:
+    """Return whether the first frame of an episode can be read; a broken one is skipped later."""
+    try:
+        episodes.read(i, keys, [0])
+    except UserError:
+        return False
+    return True

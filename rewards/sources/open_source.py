@@ -1,0 +1,87 @@
+"""Open the source of trajectories that a user names."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from touchgoal.control.features import CAMERAS, IMAGE_PREFIX
+from touchgoal.episodes.format.set_files import INFO
+from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory, open_episodes
+from touchgoal.rewards.sources.trajectory import Source
+from touchgoal.rewards.sources.video_trajectories import open_videos
+from touchgoal.runtime.errors import UserError
+
+
+def open_source(
+    path: Path,
+    camera: str,
+    index: Sequence[int] = (),
+    with_touch: bool = True,
+    fps: float | None = None,
+) -> Source:
+    """Open a source; what it holds is read later.
+
+    UserError: nothing there, no such camera or episode, nothing that can be measured, or an option
+    that the source does not take.
+
+    Args:
+        path: a set of episodes, or the folder of a run that holds one as `episodes`; a video file; a
+            folder of images; a folder of several videos or folders of images.
+        camera: the episodes' camera, by its key or its last word ("front"); of videos, what a file
+            shows that does not say so in its name.
+        index: which episodes of the set; none for all.
+        with_touch: whether touch is measured.
+        fps: frames per second of folders of images; None for 20.
+    """
+    if not path.exists():
+        raise UserError(f"{path} does not exist: give a set of episodes, a video or a folder")
+    key = camera if camera.startswith(IMAGE_PREFIX) else f"{IMAGE_PREFIX}{camera}"
+    if key not in CAMERAS:
+        names = " or ".join(name.removeprefix(IMAGE_PREFIX) for name in CAMERAS)
+        raise UserError(f"there is no camera '{camera}': choose {names}")
+    root = next((r for r in (path, path / "episodes") if (r / INFO).exists()), None)
+    if root is None:
+        if index:
+            raise UserError(f"{path} is not a set of episodes: leave --index out")
+        return open_videos(path, key, with_touch, fps)
+    if fps is not None:
+        raise UserError(f"{path} states its own frame rate: leave --fps out")
+    source = open_episodes(root, key, index, with_touch)
+    if root == path:
+        return source
+    return replace(source, summary=f"{path} is not a set of episodes; measuring the set {root}")
+
+
+def open_successes(
+    paths: Sequence[Path], camera: str, with_touch: bool, assume_success: bool
+) -> list[Source]:
+    """Open the successful episodes of one set, or several plain videos of successes.
+
+    With `assume_success` episodes without a recorded outcome count. UserError: as `open_source`; no
+    source, several sets, or sets and videos; fewer than two successes.
+    """
+    sources = [open_source(path, camera, with_touch=with_touch) for path in paths]
+    sets = [s for s in sources if isinstance(s.trajectories[0], EpisodeTrajectory)]
+    if not sources or len(sets) > 1 or (sets and len(sources) > 1):
+        raise UserError("give one set of episodes, or several videos")
+    for source in sources:
+        if source.skipped:
+            raise UserError(f"{source.skipped[0].name} is broken: {source.skipped[0].reason}")
+    if not sets:
+        if sum(len(source.trajectories) for source in sources) < 2:
+            raise UserError("a normalizer needs at least two successful videos; give more of them")
+        return sources
+    [source] = sets
+    success = {t: t.meta.get("success") for t in source.trajectories}
+    unknown = [t for t, reached in success.items() if reached is None]
+    if unknown and not assume_success:
+        raise UserError(
+            f"{len(unknown)} of {len(success)} episodes of {paths[0]} have no recorded "
+            "outcome: give --assume-success if they succeeded"
+        )
+    chosen = [t for t, reached in success.items() if reached is None or reached]
+    if len(chosen) < 2:
+        raise UserError(
+            f"a normalizer needs at least two successful episodes, {paths[0]} has {len(chosen)}"
+        )
+    return [replace(source, trajectories=chosen)]

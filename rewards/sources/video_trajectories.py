@@ -1,0 +1,246 @@
+"""Videos and folders of images as trajectories, with tactile videos beside the camera's.
+
+The name of a file says what it shows. NAME.mp4 is the camera; beside it NAME_wrist.mp4 is a second
+one, NAME_tactile_left.mp4 and NAME_tactile_right.mp4 are the fingertips (NAME_tactile.mp4: the only
+one). A trajectory may also be a folder with front.mp4, wrist.mp4, tactile_left.mp4 and so on. A
+folder of images stands for a video everywhere. `labels.csv` beside them (columns file and outcome, and
+if known object and task) says how each one ended.
+"""
+
+import csv
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+
+from touchgoal.control.features import (
+    CAMERAS,
+    CONTROL_HZ,
+    FRONT,
+    IMAGE_PREFIX,
+    TACTILE,
+    TACTILE_LEFT,
+    TACTILE_RIGHT,
+    WRIST,
+)
+from touchgoal.episodes.media import PICTURES, VIDEOS, Clip, in_natural_order, open_clip
+from touchgoal.episodes.schema import Episode, MetaValue
+from touchgoal.rewards.goals import Inputs
+from touchgoal.rewards.sources.trajectory import Skipped, Source, frames_per_chunk
+from touchgoal.runtime.errors import UserError
+
+_ROLES = {
+    "front": FRONT,
+    "wrist": WRIST,
+    "tactile_left": TACTILE_LEFT,
+    "tactile_right": TACTILE_RIGHT,
+    "tactile": TACTILE_LEFT,
+}
+"""Last words of a file's name -> what it shows."""
+_LABELS = "labels.csv"
+_FACTS = ("object", "outcome", "task")
+_SAME_RATE = 0.01  # share by which the frame rates of one trajectory may differ
+
+
+@dataclass(frozen=True)
+class VideoTrajectory:
+    """One trajectory of video files or folders of images."""
+
+    name: str
+    index: int
+    clips: Mapping[str, Clip]  # by what they show
+    fps: float
+    meta: Mapping[str, MetaValue]
+    offset: int = 0
+
+    @property
+    def source(self) -> str:
+        """See Trajectory."""
+        return self.name
+
+    @property
+    def length(self) -> int:
+        """See Trajectory."""
+        return next(iter(self.clips.values())).length
+
+    def checksum(self) -> str:
+        """Return sizes and times of the files."""
+        paths = [p for clip in self.clips.values() for p in _files(clip.path)]
+        stats = [path.stat() for path in paths]
+        return " ".join(f"{s.st_size}:{s.st_mtime_ns}" for s in stats)
+
+    def chunks(self) -> Iterator[Episode]:
+        """See Trajectory."""
+        heights_widths = [clip.shape for clip in self.clips.values()]
+        size = frames_per_chunk(sum(3 * height * width for height, width in heights_widths))
+        for chunks in zip_longest(*(clip.chunks(size) for clip in self.clips.values())):
+            frames = dict(zip(self.clips, chunks, strict=True))
+            if len({0 if chunk is None else len(chunk) for chunk in chunks}) > 1:
+                raise UserError(f"{self.name}: its videos end at different frames")
+            yield Episode(frames, self.name, dict(self.meta))
+
+
+def open_videos(path: Path, camera: str, with_touch: bool, fps: float | None) -> Source:
+    """Open a video file, a folder of images, or a folder that holds several of them.
+
+    UserError: no video or image, a frame rate given that the videos state themselves, or no
+    trajectory left that can be measured.
+
+    Args:
+        camera: key of the camera that a file without a role shows.
+        fps: frames per second of folders of images; None for 20.
+    """
+    found = _find(path, camera)
+    labels = _read_labels(path if path.is_dir() else path.parent)
+    opened: list[VideoTrajectory] = []
+    skipped: list[Skipped] = []
+    for i, (name, files) in enumerate(found.items()):
+        kept = {k: f for k, f in files.items() if with_touch or k not in TACTILE}
+        try:
+            trajectory = _open(name, i, kept, fps)
+        except UserError as error:
+            skipped.append(Skipped(name, str(error)))
+        else:
+            offset = opened[-1].offset + opened[-1].length if opened else 0
+            opened.append(replace(trajectory, offset=offset, meta=labels.get(name, {})))
+    if not opened:
+        raise UserError(skipped[0].reason)
+    keys = list(opened[0].clips)
+    for trajectory in opened[1:]:
+        if set(trajectory.clips) != set(keys):
+            raise UserError(
+                f"{trajectory.name} shows {_words(trajectory.clips)}, but {opened[0].name} "
+                f"{_words(keys)}: measure them apart, or give each the same videos"
+            )
+    shortest = min(opened, key=lambda trajectory: trajectory.length)
+    inputs = Inputs(
+        name=shortest.source,
+        camera=camera if camera in keys else None,
+        sides=tuple(key for key in TACTILE if key in keys),
+        scene="a plain video",
+        length=shortest.length,
+        cameras=tuple(key for key in CAMERAS if key in keys),
+    )
+    return Source(inputs, opened, skipped, _summary(path, opened))
+
+
+def _find(path: Path, camera: str) -> dict[str, dict[str, Path]]:
+    """Return name -> what is shown -> file or folder of images."""
+    if path.is_file():
+        name = _split_name(path)[0] or path.parent.name
+        return {name: _group(path.parent, camera).get(name, {camera: path})}
+    entries = in_natural_order(path.iterdir())
+    if any(e.suffix.lower() in PICTURES for e in entries) or _is_trajectory(path):
+        return {path.resolve().name: _files_of(path, camera)}
+    found = _group(path, camera)
+    for folder in entries:
+        if folder.is_dir() and (files := _files_of(folder, camera)):
+            found[folder.name] = files
+    if not found:
+        open_clip(path)  # says what is missing
+    return found
+
+
+def _files_of(folder: Path, camera: str) -> dict[str, Path]:
+    """Return the files of one trajectory's folder by what they show; {} if it is none."""
+    if _is_trajectory(folder):
+        return {
+            _ROLES[entry.stem]: entry
+            for entry in in_natural_order(folder.iterdir())
+            if entry.stem in _ROLES and (entry.is_dir() or entry.suffix.lower() in VIDEOS)
+        }
+    if any(entry.suffix.lower() in PICTURES for entry in folder.iterdir()):
+        return {camera: folder}
+    groups = list(_group(folder, camera).values())
+    return groups[0] if len(groups) == 1 else {}
+
+
+def _is_trajectory(folder: Path) -> bool:
+    """Whether a file or folder of images in it is named by what it shows alone: front.mp4."""
+    return any(
+        entry.stem in _ROLES and (entry.is_dir() or entry.suffix.lower() in VIDEOS)
+        for entry in folder.iterdir()
+    )
+
+
+def _group(folder: Path, camera: str) -> dict[str, dict[str, Path]]:
+    """Return the videos of a folder by the name that they share, and by what they show."""
+    groups: dict[str, dict[str, Path]] = {}
+    for path in in_natural_order(folder.iterdir()):
+        if path.suffix.lower() not in VIDEOS or path.is_dir():
+            continue
+        name, role = _split_name(path)
+        shows = groups.setdefault(name, {})
+        key = _ROLES.get(role, camera)
+        if key in shows:
+            raise UserError(f"{path} and {shows[key]} both show {_words([key])}: rename one")
+        shows[key] = path
+    return groups
+
+
+def _split_name(path: Path) -> tuple[str, str]:
+    """Return a file's name without its role, and the role: "a_wrist.mp4" -> "a", "wrist"."""
+    for role in _ROLES:
+        if path.stem == role or path.stem.endswith(f"_{role}"):
+            return path.stem.removesuffix(role).removesuffix("_"), role
+    return path.stem, ""
+
+
+def _open(name: str, index: int, files: Mapping[str, Path], fps: float | None) -> VideoTrajectory:
+    clips = {key: open_clip(files[key]) for key in (*CAMERAS, *TACTILE) if key in files}
+    if not clips:
+        raise UserError(f"{name} has nothing to measure: give a camera's video")
+    first = next(iter(clips.values()))
+    for clip in clips.values():
+        if clip.length < 2:
+            raise UserError(f"{clip.path} has one frame: a curve needs at least 2")
+        if clip.length != first.length:
+            raise UserError(
+                f"{clip.path} has {clip.length} frames, {first.path} {first.length}: "
+                "a trajectory's videos need equally many"
+            )
+        if abs((clip.fps or 1) / (first.fps or 1) - 1) > _SAME_RATE:
+            raise UserError(f"{clip.path} and {first.path} have different frame rates")
+    if fps is not None and first.fps is not None:
+        raise UserError(f"{first.path} states its own frame rate: leave --fps out")
+    return VideoTrajectory(name, index, clips, fps or first.fps or CONTROL_HZ, {})
+
+
+def _read_labels(folder: Path) -> dict[str, dict[str, MetaValue]]:
+    """Return the facts in `labels.csv` by name of the trajectory; {} without the file."""
+    path = folder / _LABELS
+    if not path.is_file():
+        return {}
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    if rows and not {"file", "outcome"} <= rows[0].keys():
+        raise UserError(f"{path} needs the columns file and outcome")
+    return {_split_name(Path(row["file"]))[0]: _facts(row) for row in rows}
+
+
+def _facts(row: Mapping[str, str]) -> dict[str, MetaValue]:
+    facts: dict[str, MetaValue] = {key: row[key] for key in _FACTS if row.get(key)}
+    return facts | ({"success": row["outcome"] == "success"} if row["outcome"] else {})
+
+
+def _files(path: Path) -> list[Path]:
+    return in_natural_order(path.iterdir()) if path.is_dir() else [path]
+
+
+def _words(keys: Iterable[str]) -> str:
+    return ", ".join(key.removeprefix(IMAGE_PREFIX) for key in sorted(keys))
+
+
+def _summary(path: Path, opened: Sequence[VideoTrajectory]) -> str:
+    """Return number, length and rate, and the goals that images alone can take."""
+    first = opened[0]
+    what = f"{first.length} frames at {first.fps:g} per second"
+    if len(opened) > 1:
+        what = f"{len(opened):,} trajectories, {sum(t.length for t in opened):,} frames"
+    text = f"{path.name}: {what}, {_words(first.clips)}"
+    if any(key in TACTILE for key in first.clips):
+        return text
+    return (
+        f"{text}, images alone. Goals are images: last, frame:K, image:PATH or episode:ROOT#K; a "
+        "sentence (text:...) needs towers that compare images with words: --towers CLIP"
+    )
