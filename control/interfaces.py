@@ -95,7 +95,7 @@ class Arm(Protocol):
 
 @runtime_checkable
 class Gripper(Protocol):
-    """A parallel gripper; `command` takes the width (m) to go to, or to hold something before it."""
+    """A parallel gripper; `command` closes or opens it to a width (m), or onto an object."""
 
     def read(self) -> GripperReading:
         """Return the newest state."""
@@ -157,7 +157,7 @@ class LoadCell(Protocol):
 
 
 class Actor:
-    """Whatever acts in the control loop; `act` never waits for as long as a tick."""
+    """Source of actions in the control loop; `act` returns in less than a tick."""
 
     done = False  #: whether its plan has ended
     action_age = 0.0  #: s for which it has had no new answer

@@ -14,9 +14,9 @@ _FULL = 1_000_000  # bytes free, below which a failed write is blamed on the dis
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary name to write to; move the file to `path` once it is on disk.
 
-    Its folder is made if needed. To change two files together, open first the one that is to be
-    replaced last. A block that fails leaves the older file as it was. OSError: it cannot be
-    written; with the path, also where a library reports a full disk in its own way.
+    Its folder is made if needed. For two files, nest the blocks: the outer block's file is replaced
+    last. A block that fails leaves the older file as it was. OSError, with the path: it cannot be
+    written; a library's own report of a full disk counts, too.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + ".tmp")

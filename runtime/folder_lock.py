@@ -10,7 +10,7 @@ from touchgoal.runtime.errors import UserError
 
 
 class FolderLock:
-    """Lock on a folder, made if need be, until released, garbage or the process ends.
+    """Lock on a folder (made if needed), held until release, garbage collection or process end.
 
     The kernel holds it, so that a killed process leaves no stale lock. File systems without locks
     (some network ones) are let through.
@@ -21,10 +21,9 @@ class FolderLock:
         folder: Path,
         refusal: str = "something else is recording into {}: wait for it or give another folder",
     ) -> None:
-        """Take the lock.
+        """Take the lock; {} in the error message `refusal` stands for the folder.
 
-        UserError: another one holds it, with the refusal ({} stands for the folder); or the folder
-        cannot be made.
+        UserError: another process holds it, or the folder cannot be made.
         """
         made = not folder.exists()
         try:

@@ -8,7 +8,7 @@ from touchgoal.runtime.atomic_write import write_file
 
 
 def parse_json(data: bytes) -> Any:
-    """Parse a JSON document; ValueError if it is none, or a key stands twice in one object."""
+    """Parse a JSON document; ValueError if it is not JSON, or repeats a key in one object."""
     try:
         return json.loads(data, object_pairs_hook=_unique)
     except RecursionError as error:

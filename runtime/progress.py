@@ -11,7 +11,7 @@ Item = TypeVar("Item")
 
 
 def progress_bar(what: str, total: int | None, unit: str) -> "tqdm[Any]":
-    """Return a bar that counts work, such as "filming", in a unit, in the singular.
+    """Return a progress bar named `what`, such as "filming", that counts in a singular `unit`.
 
     `with progress_bar(…) as bar: … bar.update()`; the total is None if unknown.
     """

@@ -56,7 +56,7 @@ def provenance() -> dict[str, Any]:
     """Return what every checkpoint and every folder of results records beside its numbers.
 
     `dirty` tells whether files differ from `commit`; both are None for an installed package. The
-    command is without folders of this machine, the date is local time.
+    command contains no folders of this machine; the date is local time.
     """
     commit, dirty = _commit()
     return {

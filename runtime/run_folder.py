@@ -65,7 +65,7 @@ def release_runs() -> None:
 
 
 def _hold(folder: Path) -> None:
-    """Lock the folder against other processes; commands of this one may share it."""
+    """Lock the folder against other processes; commands of the same process may share it."""
     if (key := folder.resolve()) not in _held or not key.exists():
         _held[key] = FolderLock(
             folder, "another command is writing into {}: wait for it or name another --out"

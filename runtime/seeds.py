@@ -1,4 +1,4 @@
-"""Random seeds of episodes: one named range a purpose, no two of which overlap.
+"""Random seeds of episodes: one named range for each purpose; ranges do not overlap.
 
 A scene is drawn from its episode's seed, so two purposes that share a seed share a scene. Whatever
 is trained, chosen or reported takes its seeds from here.

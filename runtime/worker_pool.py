@@ -19,7 +19,7 @@ def one_core_workers(workers: int) -> Iterator[ProcessPoolExecutor]:
 
     OpenGL contexts do not survive a fork, so workers are forked from a server that never renders; it
     imports once what this process has imported. If the block ends early, by Ctrl-C for example, or if
-    this process is killed, the workers end at once and lose what they work on.
+    this process is killed, the workers end at once and drop their current work.
     """
     others = set(multiprocessing.active_children())
     forkserver = multiprocessing.get_context("forkserver")

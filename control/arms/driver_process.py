@@ -1,4 +1,4 @@
-"""A driver in its own process, which may hang, crash or lose its parent, and is ended in time.
+"""A driver in its own process, which is ended in time if it hangs, crashes or loses its parent.
 
 Vendors' client libraries hang on a taken robot, ignore Ctrl-C and crash when a link drops. The
 process ends when a call is not answered in time, when the parent dies (the pipe closes), or by the
@@ -40,7 +40,7 @@ class Driver(Protocol):
 
 
 class DriverProcess:
-    """Parent's end: it makes `driver(*args)` in a child process and calls its methods.
+    """Parent's end of the pipe: makes `driver(*args)` in a child process and calls its methods.
 
     `driver` is a class at the top of an importable module; arguments and answers are pickled. Calls
     may come from several threads, not from a signal handler. `exit_reason` says why the process

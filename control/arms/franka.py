@@ -51,8 +51,9 @@ class FrankaClient(ArmClient):
     def _limits(self, robot: "franky.Robot") -> JointLimits:
         """Set franky's limits and return the stream's.
 
-        franky's defaults are the Panda's, in part above the FR3's, and cannot be raised where they
-        are below; 1 and 2 % are for the controller's differences of rounded positions.
+        franky's defaults are the Panda's: some exceed the FR3's, and those below cannot be raised.
+        The controller differentiates rounded positions, so acceleration and jerk stay 1 and 2 %
+        lower.
         """
         hardware, interface = self.config.robot.hardware, self.config.robot.interface
         wanted = (

@@ -53,7 +53,7 @@ class ArmClient(ABC):
         self.period = NEVER if config.lock_step else self._stream_period
         self._state: TrackerState | None = None
         self._twin_time: float | None = None
-        # A tracker's first step is compiled, or read from the disk: before a controller waits for it.
+        # Compile (or load) a tracker's first step now, before a controller waits for it.
         self._make_tracker(config.robot.interface)
         self._tracker = self._make_tracker(self._connect(recover))
         self._clock, self._stamp = -1.0, time.monotonic()
@@ -79,11 +79,11 @@ class ArmClient(ABC):
 
     @abstractmethod
     def _halt(self) -> None:
-        """Brake as the controller does it; an exception changes nothing."""
+        """Brake by the controller's own means; an exception is ignored."""
 
     @abstractmethod
     def _disconnect(self) -> None:
-        """Disconnect; an exception changes nothing."""
+        """Disconnect; an exception is ignored."""
 
     def read(self) -> ArmReading:
         """Return the state as of the last tick."""

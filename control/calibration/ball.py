@@ -15,21 +15,21 @@ from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 from touchgoal.runtime.errors import UserError
 
 _FIND_BLUR = 2.0  # px
-_DISC_SHARE = 0.3  # of the strongest change, at which the disc is taken to end
+_DISC_SHARE = 0.3  # share of the strongest change at the disc's outline
 _MIN_CHANGE = 8.0  # counts
 # The gel bulges around the contact: the visible disc is larger. On 46 real presses of two balls the
 # fitted contacts are 0.7 of it.
 _CONTACT_PER_DISC = 0.7
-_INSIDE = 0.9  # of the contact's radius, in which the gel follows the ball
+_INSIDE = 0.9  # share of the contact's radius within which the gel follows the ball
 _OUTLIER = 20e-6  # m
 
 
 def ball_overlap(shape: tuple[int, int], pitch: float, circle: Circle, ball_radius: float) -> Map:
-    """Return the overlap (m) of ball and flat gel with which the deformed gel touches in a circle.
+    """Return the overlap (m) of ball and flat gel that makes the deformed gel touch in `circle`.
 
     The gel touches where the overlap exceeds `gel.CONTACT_SHARE` of its maximum, so the ball's cap
-    over the circle has the remaining share of its depth. `pitch` is m per pixel; the ball's radius
-    (m) must exceed the contact's.
+    over the circle is `1 - CONTACT_SHARE` of the deepest overlap. `pitch` is m per pixel; the
+    ball's radius (m) must exceed the contact's.
     """
     x, y, radius = circle
     rows, cols = np.ogrid[: shape[0], : shape[1]]
@@ -65,7 +65,7 @@ def find_circle(image: Picture, background: Picture) -> Circle:
     disc = cv2.morphologyEx(disc, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8))
     outlines, _ = cv2.findContours(disc, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not outlines:
-        raise UserError("what changes is no disc: drop the picture, or give its circle")
+        raise UserError("the change is not a disc: drop the picture, or give its circle")
     (x, y), radius = cv2.minEnclosingCircle(max(outlines, key=cv2.contourArea))
     return np.array([x, y, _CONTACT_PER_DISC * radius])
 
@@ -74,9 +74,9 @@ def find_circle(image: Picture, background: Picture) -> Circle:
 class DepthErrors:
     """Errors of the depth read from one press."""
 
-    radius: float  # of the sphere in the depth map, over the ball's
+    radius: float  # radius of the sphere in the depth map over the ball's
     residual: float  # root mean square distance of the depth map from that sphere, m
-    peak_offset: float  # of its deepest point from the contact's centre, m
+    peak_offset: float  # distance of its deepest point from the contact's centre, m
 
 
 def sphere_in(depth: Map, pitch: float, circle: Circle, ball_radius: float) -> DepthErrors:

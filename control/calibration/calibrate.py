@@ -21,18 +21,18 @@ from touchgoal.control.tactile.sensor_calibration import (
 )
 
 ILLUMINATION_EXPONENTS = (1.0, 1.5, 2.0, 2.5)
-"""What `select_illumination_exponent` chooses from."""
+"""Candidates of `select_illumination_exponent`."""
 STEPS = 5
 """How often `fit` reports progress."""
 SQUARES_MINIMUM = 40
-"""Presses that squares of the place need; tried on 46, of which up to six were left out."""
+"""Least number of presses for `squares`; tested on 46 presses, up to six of them left out."""
 
 # Position terms need presses spread over the picture: the standard deviation of the centres, as a
 # share of the picture, in both directions (evenly spread over all of it: 0.29).
 _MIN_SPREAD = 0.1
 _WINDOWS = (4.0, 8.0, 16.0, 32.0, 64.0)  # px
-_DEPTH_PRESSES = 12  # whose depth decides on the light's power
-_FAR = 4.0  # contact radii from which on a press leaves the gel as it was
+_DEPTH_PRESSES = 12  # presses whose depth decides on the illumination exponent
+_FAR = 4.0  # contact radii beyond which a press leaves the gel at rest
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,8 @@ class FittedCalibration:
     def fit_circles(self, presses: PressSet) -> Circles:
         """Move the circles (px) of other presses from their labels to their pictures.
 
-        An error at these circles is the model's alone; an error at `correct_labels` includes the
-        labels'.
+        Errors at these circles come from the model alone; errors at `correct_labels` include label
+        errors.
         """
         return press_fit.move_circles(self.calibration, presses, self.correct_labels(presses))
 
@@ -86,7 +86,7 @@ def fit(
 
     `on_progress` is called STEPS times. With `trust_labels` the circles stay as they are, but for
     one common scale of their radii. `illumination_exponent`: see `select_illumination_exponent`.
-    With `squares` the response varies with the square of the place, too, for gels whose light falls
+    With `squares` the response also varies with the squared position, for gels whose light falls
     off towards the borders.
     """
     background, varies_over_image = median_background(presses), _spread_out(presses)
@@ -131,11 +131,11 @@ def select_illumination_exponent(
     on_progress: Callable[[], object] = lambda: None,
     squares: bool = False,
 ) -> float:
-    """Return the illumination exponent that reads the balls of these presses at their size.
+    """Return the illumination exponent with which depth shows these balls at their true radius.
 
-    The error of pictures cannot decide: it is the same within a hundredth of a count.
+    The image error cannot decide: it is the same for all within a hundredth of a count.
 
-    `pitch` is m per pixel; `on_progress` is called once an exponent tried; `squares` as in `fit`.
+    `pitch` is m per pixel; `on_progress` is called after each exponent; `squares` as in `fit`.
     """
     wrong = {}
     chosen = np.arange(0, len(presses), max(1, len(presses) // _DEPTH_PRESSES))
@@ -166,9 +166,9 @@ def depth_errors(
 def median_background(presses: PressSet) -> Picture:
     """Return the background as the presses show it away from their contacts.
 
-    A gel settles under the first presses: bands of several counts against the picture before them.
-    Where fewer than three presses lie far away, the given background takes the change of its
-    surroundings, so that no seam is left.
+    A gel settles under the first presses, which leaves bands of several counts. Where fewer than
+    three presses are far away, the given background is changed as its surroundings are, so that no
+    seam is left.
     """
     rows, cols = np.ogrid[: presses.background.shape[0], : presses.background.shape[1]]
     x, y, radius = presses.circles.T[:, :, None, None]

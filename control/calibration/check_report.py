@@ -16,7 +16,7 @@ _SHOWN = 4  # presses in the picture
 _CONTRAST = 4  # of the change column
 _GRAVITY = 9.81  # m/s^2
 _MARGIN = 2.0  # times the threshold that a usual touch should have
-_UNLIKE = 5.0  # counts of local change; drift of the full spread between real touches gives 3
+_UNLIKE = 5.0  # counts of local change; the usual drift between real touches gives 3
 _DEPTH_OFF, _FORCE_OFF = 0.1, 0.2
 
 

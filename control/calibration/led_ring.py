@@ -1,4 +1,4 @@
-"""Sensor file of a drawn lamp ring: a matt gel under three lamps, for sensors without presses.
+"""Sensor file computed from a ring of three lamps and a matt gel, for sensors without presses.
 
 `touchgoal calibrate` fits a real one.
 """
@@ -25,9 +25,9 @@ class LedRing:
 
 # As real Wedges light their gel (EstimateModulus' pictures, rectified): red from below, green from
 # the left, blue from above, each flank of a ball's imprint in the colour of the side that it faces.
-# Distances: chosen of a few by a grasp of a golf ball, 26 % of whose change they leave unexplained
-# (`touchgoal check-sensor`); of the same sensor's other grasp of it 34 %, of another session's two
-# 51 and 61 %.
+# Distances: the best of a few on one grasp of a golf ball, of whose change they leave 26 %
+# unexplained (`touchgoal check-sensor`). Three other grasps: 34 % (same sensor), 51 and 61 %
+# (another session).
 WEDGE_RING = LedRing(azimuths=(90.0, 180.0, -90.0), radius=30e-3, distance=50e-3)
 
 

@@ -1,8 +1,8 @@
 """Steps of the fit of a sensor's light and gel to ball presses.
 
 With the surface under each press known, the change of colour is linear in the response
-(`sensor_calibration.design_matrix`): least squares. Steps that move the balls (hand-made circles
-are off by pixels) and that select the non-linear parameters by cross-validation alternate with it.
+(`sensor_calibration.design_matrix`): least squares. It alternates with steps that move the circles
+(hand-made ones are off by pixels) and that select the non-linear parameters by cross-validation.
 """
 
 import math
@@ -31,12 +31,12 @@ NARROWEST, WIDEST = 2.0, 0.98
 BLUR_PYRAMID = (3.0e-3, 1.5e-3, 0.75e-3, 0.35e-3)
 """Standard deviations of Taxim's gel, m; one factor scales them all."""
 
-_PIXELS = 5000  # of a press that take part in the fit
+_PIXELS = 5000  # pixels of a press that take part in the fit, at most
 _LIGHTS = 3  # whose shadows are fitted
 _FOLDS = 4
 _MOVES = 8  # Gauss-Newton steps of a circle
-_RIDGE = 1e-3  # of each term's own energy; between 1e-4 and 1e-2 the held-out error hardly moves
-# What cross-validation chooses from.
+_RIDGE = 1e-3  # share of each term's own energy; 1e-4 to 1e-2 give nearly the same held-out error
+# Candidates of cross-validation.
 BLUR_SCALES = (0.15, 0.25, 0.35, 0.5, 0.7, 1.0)
 _SHADOW_SLOPES = (0.05, 0.1, 0.2, 0.4, 0.8)
 _PENUMBRAS = (0.03e-3, 0.1e-3, 0.3e-3, 1e-3)
@@ -135,8 +135,8 @@ class PressFit:
     def fit_common_scale(self, state: FitState) -> FitState:
         """Scale all contacts and balls together if that explains the pictures better.
 
-        A weaker response to steeper slopes, or a wider bulge around a smaller contact, looks nearly
-        the same: single steps would take long.
+        Scaling alone converges slowly: a weaker response to steeper slopes, or a wider bulge around
+        a smaller contact, looks nearly the same.
         """
         candidates = []
         for scale in _COMMON_SCALES:
@@ -247,9 +247,10 @@ class PressFit:
 
 
 def move_circles(calibration: SensorCalibration, presses: PressSet, start: Circles) -> Circles:
-    """Move circles (px) of presses of known balls from a start to their pictures, by a sensor file.
+    """Return the circles (px) that best explain presses of known balls by a sensor file.
 
-    The presses are in the light of the file's background; their own circles bound the search.
+    The presses are in the light of the file's background; the search begins at `start` and is
+    bounded by the circles of the presses.
     """
     widest = WIDEST * presses.ball_radius / calibration.pixel_pitch
     circles = np.array(start, np.float64)

@@ -23,7 +23,7 @@ _STILL = 5  # frames in which a press must stand still
 _SETTLED = 1.0  # counts of local change between the medians of the first and of the last five
 _STEADY = 2.5  # counts of local change from frame to frame of a press in a person's hand, at most
 _SMALLEST = 6.0  # px, radius of a contact that shows slopes
-# By the number of rows, or of columns, of the map.
+# Names of the map's rows, and of its columns, by their number.
 _PLACES = {3: ("top", "middle", "bottom"), 4: ("top", "upper middle", "lower middle", "bottom")}
 _SIDES = {
     3: ("left", "middle", "right"),
@@ -32,9 +32,10 @@ _SIDES = {
 
 
 class PressRecorder:
-    """Recorder of one picture of every press: the first in which it stands still.
+    """Recorder of one picture per press: the first in which the ball stands still.
 
-    `a_cell` presses are wanted in each cell of the map of frames of a shape (rows, columns).
+    `shape` is that of the frames (rows, columns); `a_cell` is the number of presses wanted in each
+    cell of the map.
     """
 
     def __init__(self, shape: tuple[int, int], a_cell: int = 2) -> None:
@@ -45,7 +46,7 @@ class PressRecorder:
         self.hint = "leave the gel untouched"  # for the person who presses
         self._recent = deque[Picture](maxlen=_SETTLING)
         self._detector: ContactDetector | None = None
-        self._taken = False  # of this contact
+        self._taken = False  # whether this contact is recorded
 
     @property
     def background(self) -> Picture:

@@ -15,11 +15,11 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
 
 COLUMNS = ("file", "x_px", "y_px", "radius_px", "ball_mm")
-# Twelve are fitted and four held out: with fewer, the 30 response terms of a channel follow single
-# presses, and the held-out error of the GelSight presses is a tenth above that of 36.
+# Twelve are fitted and four held out. With fewer, the 30 response terms of a channel overfit single
+# presses. With twelve, the held-out error on GelSight is a tenth above that with 36.
 MINIMUM = 16
-# A pressed ball changes the picture by tens of counts. Camera noise is about 1 count, half of it
-# in the mean of a few hundred pixels; slow drift of the light reached 7.
+# A pressed ball changes the picture by tens of counts. Camera noise is about 1 count (0.5 in the
+# mean of a few hundred pixels); slow drift of the light reached 7.
 _VISIBLE = 10.0
 _FAR = 3.0  # contact radii beyond which a press leaves the gel at rest
 _LINE_ROUNDS, _LINE_TOLERANCE = 4, 1.0  # of the robust line; counts
@@ -116,7 +116,7 @@ def read_presses(folder: Path, pitch: float, ball_mm: float = math.nan) -> Press
 
 
 def _read_rows(folder: Path, ball_mm: float) -> list[tuple[str, Circle, float]]:
-    """Return file, circle (px) and ball's radius (mm) of each press; NaN where nothing is said."""
+    """Return file, circle (px) and ball's radius (mm) of each press; NaN for an empty cell."""
     path = folder / "presses.csv"
     if not path.is_file():
         if math.isnan(ball_mm):

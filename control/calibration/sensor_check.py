@@ -21,7 +21,8 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
 
 _PRESSES = 12  # presses that are read: the firmest frame of as many stretches of contact
-_FIRM = 0.3  # of the strongest: a ball that only comes or goes has no depth to compare
+# share of the strongest: weaker ones, as a ball comes or goes, have no depth to compare
+_FIRM = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +116,7 @@ def check_sensor(
     firm = _firmest(touches)
     untouched_now = np.rint(followed.image).astype(np.uint8)
     plain = dots.painted(untouched_now, at_rest=True)
-    aligned = [_in_light(touch, plain) for touch in firm]
+    aligned = [_on_background(touch, plain) for touch in firm]
     picture_guard.check_presses(plain, aligned, sensor, "the frames in contact")
     readings = _read(firm, sensor, calibration, ball_radius)
     explained = [
@@ -194,14 +195,14 @@ def _read(
 def _contact_circle(touch: _Touch, calibration: SensorCalibration, ball_radius: float) -> Circle:
     """Find a ball's contact circle and fit it as `calibrate` does; UserError if it is too faint."""
     background = calibration.background
-    image = _in_light(touch, background)
+    image = _on_background(touch, background)
     found = find_circle(image, background)[None]
     press = PressSet(background, image[None], found, np.array([ball_radius]), ("",))
     return move_circles(calibration, press, found)[0]
 
 
-def _in_light(touch: _Touch, background: Picture) -> Picture:
-    """Return the touch as it would look on another untouched picture of its sensor."""
+def _on_background(touch: _Touch, background: Picture) -> Picture:
+    """Return the touch's frame with its background exchanged for another one."""
     change = touch.plain - touch.background  # float
     return np.rint(background + change).clip(0, 255).astype(np.uint8)
 

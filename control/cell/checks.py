@@ -1,4 +1,4 @@
-"""Checks of a cell file that no field makes by itself; each UserError names the key."""
+"""Checks of a cell file across its fields; each UserError names the key."""
 
 import numpy as np
 

@@ -34,7 +34,7 @@ class GripperSection:
     kind: Literal["franka_hand", "robotiq"]
     """franka_hand needs `address`, robotiq needs `port`."""
     address: str = ""
-    """Network address of a Franka Hand: the arm's."""
+    """Network address of a Franka Hand: the same as the arm's."""
     port: str = ""
     """Serial port of a Robotiq, such as /dev/ttyUSB0."""
     force: Annotated[float, Field(gt=0)] = 30.0
@@ -161,13 +161,13 @@ class SafetySection:
     velocity_share: Annotated[float, Field(gt=0, le=1)] | None = None
     """Share of the maker's joint speed that a policy may use."""
     force: Annotated[float, Field(gt=0, le=100)] | None = None
-    """Force from outside at the hand that stops the arm, N, and change of the load cell's; default: the
-    task's own, which is above what its demonstrations reach and below the arm's reflex."""
+    """External force at the hand, or change of the load cell's force, that stops the arm, N; default:
+    the task's own, above its demonstrations and below the arm's reflex."""
     torque: Annotated[float, Field(gt=0, le=100)] | None = None
-    """Torque from outside in a joint that stops the arm, Nm; default: the task's own."""
+    """External torque in a joint that stops the arm, Nm; default: the task's own."""
     indentation: Annotated[float, Field(gt=0, le=0.005)] | None = None
-    """Depth that a gel is pressed in at which the arm stops and the hand opens, m; default: the task's
-    own, as deep as the sensor file can read."""
+    """Indentation of a gel at which the arm stops and the hand opens, m; default: the task's own, at
+    most what the sensor file can read."""
     observation_age: Seconds = 0.1
     """Age of a picture at which the arm holds, s; five times that stops it."""
     state_age: Seconds = 0.05

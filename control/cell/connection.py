@@ -26,12 +26,12 @@ from touchgoal.control.sensors.tactile_camera import TactileCamera, fingertip_vi
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
 
-# Hz, and s without a picture, on the wall: what a machine however loaded still manages.
+# Hz, and s of wall time without a picture: slow enough for any loaded machine.
 _LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 0.1, 10.0
-_TWIN_RATE = 25.0  # pictures of a twin in a second of its time, at least
-_CLOCK_TIMEOUT = 1.0  # s on the wall for which an arm's clock may stand
-_POLL_INTERVAL = 0.002  # s between looks at it
-_HISTORY_LENGTH = 2000  # of them
+_TWIN_RATE = 25.0  # Hz of a twin's pictures in its own time, at least
+_CLOCK_TIMEOUT = 1.0  # s of wall time for which an arm's clock may stand still
+_POLL_INTERVAL = 0.002  # s between readings of it
+_HISTORY_LENGTH = 2000  # readings
 
 
 @runtime_checkable
@@ -69,8 +69,8 @@ class RealClock:
 class ArmClock:
     """The arm's own clock, for a UR's twin in lock-step, whose time passes as the machine allows.
 
-    Stamps are wall time; a history maps them to the arm's. When the arm's clock stands for longer than
-    a loaded machine explains, time goes on all the same, so that ages show it.
+    Stamps are wall time; a history maps them to the arm's. When the arm's clock stands still for
+    longer than `_CLOCK_TIMEOUT`, wall time takes over, so that ages show it.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -100,7 +100,7 @@ class ArmClock:
 class CellConnection:
     """Connected devices; `close` brings the arm to rest and releases all of them.
 
-    `cameras` are with the fingertips, by their key in `features`. `truth` returns what a simulator
+    `cameras` include the fingertips, by their key in `features`. `truth` returns what a simulator
     knows, and may take a while; None for a real cell.
     """
 

@@ -1,4 +1,4 @@
-"""A cell's limits: the robot's, with the task's ceilings and the cell file's own in their place."""
+"""A cell's limits: the robot's, overridden by the task's ceilings and by the cell file."""
 
 from dataclasses import replace
 

@@ -15,13 +15,13 @@ from touchgoal.control.interfaces import Camera, DriverError
 from touchgoal.control.sensors.load_cell import SerialLoadCell
 from touchgoal.runtime.errors import UserError
 
-_TIMEOUT = 60.0  # s for an answer, on a machine however loaded
+_TIMEOUT = 60.0  # s for an answer, on a loaded machine, too
 _REST_TIMEOUT, _POLL_INTERVAL = 10.0, 0.1  # s for the arm of the run before to come to rest
 _DT = 1e-3  # s of a step of the twin
-_STREAM_STEPS = 5  # of them between two commands of the arm's stream, `arms.franka.RATE`
+_STREAM_STEPS = 5  # steps between two commands of the arm's stream, `arms.franka.RATE`
 _PICTURE_TIMEOUT = 2.0  # s for a picture that was sent
 _SETTLING = 0.3  # s without a picture after which none is on its way
-_HISTORY_LENGTH = 400  # of a few steps each, for the ages of readings
+_HISTORY_LENGTH = 400  # times kept for the ages of readings
 
 
 def connect_control_port(address: str) -> socket.socket:
@@ -49,7 +49,7 @@ def ask_twin(address: str, line: str) -> dict[str, Any]:
 
 
 def put_scene_back(address: str, seed: int) -> None:
-    """Make a twin begin the episode of a seed, once its arm rests: arm, open hand and objects.
+    """Once a twin's arm rests, put arm, hand and objects to the start of a seed's episode.
 
     UserError if the arm keeps moving, another program drives it, or there is no twin.
     """
@@ -85,7 +85,7 @@ class LockStepClock:
         self._issued = self._answered = 0
         answer = self._ask("hold")
         self._time = self._gripper_due = answer["time"]
-        self._swallowed = self._swallowed_pictures(answer["pictures"])
+        self._missed = self._missed_pictures(answer["pictures"])
         self._history = deque([(time.monotonic(), self._time)], maxlen=_HISTORY_LENGTH)
 
     def reset(self, seed: int) -> None:
@@ -94,7 +94,7 @@ class LockStepClock:
         self._time = self._gripper_due = 0.0
         self._history.clear()
         self._history.append((time.monotonic(), 0.0))
-        self._arm.advance(0.0)  # from here on it goes by this time, not by libfranka's
+        self._arm.advance(0.0)  # the driver now follows this time, not libfranka's
 
     def now(self) -> float:
         """See Clock."""
@@ -108,7 +108,7 @@ class LockStepClock:
         """See Clock."""
         weighed = -np.inf
         while (steps := round((until - self._time) / _DT)) > 0 and not self._lost:
-            # Steps end where the stream's commands are due, whatever is waited for.
+            # An advance ends at the latest when the stream's next command is due.
             steps = min(steps, _STREAM_STEPS - round(self._time / _DT) % _STREAM_STEPS)
             answer = self._ask(f"advance {steps} {int(self._driven)} {self._issued}")
             if self._lost:
@@ -141,7 +141,7 @@ class LockStepClock:
             self._history.append((time.monotonic(), self._time))
             self._arm.advance(self._time)
 
-    def _swallowed_pictures(self, sent: dict[str, int]) -> dict[str, int]:
+    def _missed_pictures(self, sent: dict[str, int]) -> dict[str, int]:
         """Return the number of sent pictures that each camera has missed; DriverError for a broken one."""
         found: dict[str, int] | None = None
         while True:
@@ -157,13 +157,14 @@ class LockStepClock:
         return [(key, name, camera) for key, name, camera in named if name in sent]
 
     def _await_pictures(self, sent: dict[str, int]) -> None:
-        """Wait for all pictures that the twin has sent, but for lost ones."""
+        """Wait for all pictures that the twin has sent, except lost ones."""
         end = time.monotonic() + _PICTURE_TIMEOUT
         for key, name, camera in self._streams(sent):
             with suppress(DriverError):
-                while (missing := sent[name] - self._swallowed[key] - camera.read().sequence) > 0:
-                    if time.monotonic() > end:  # lost, as when a stream is opened again
-                        self._swallowed[key] += missing
+                while (missing := sent[name] - self._missed[key] - camera.read().sequence) > 0:
+                    # the picture is lost, as when a stream is opened again
+                    if time.monotonic() > end:
+                        self._missed[key] += missing
                         break
                     time.sleep(_DT / 2)
 

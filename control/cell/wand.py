@@ -92,7 +92,7 @@ class Wand:
     _last: int = field(default=-1, init=False)
 
     def read(self) -> Moment | None:
-        """Return the present, once for each new picture of the gel; DriverError as the devices."""
+        """Return the readings, or None until the gel's next picture; DriverError as the devices."""
         frame = self.gel.read()
         if frame.sequence == self._last:
             return None
@@ -130,7 +130,7 @@ def connect_wand(config: WandConfig) -> Wand:
             cameras[name] = keep(VideoCamera(video))
         gel = keep(_open_gel(config.gel))
         wand = Wand(gel, cameras, keep(SerialLoadCell(config.load_cell)))
-        wand.read()  # a silent device is said now
+        wand.read()  # raises now if a device is silent
         undo.pop_all()
     return wand
 

@@ -1,7 +1,7 @@
-"""Recording of touches that a person makes with a real wand, picked from what its devices show.
+"""Recording of touches that a person makes with a real wand, picked from its devices' readings.
 
-Contact begins when load cell and gel agree, and ends when either says so. What the load cell reads
-in free air is taken off: the head's weight on it changes with the wand's tilt.
+Contact begins when load cell and gel both show it, and ends when either no longer does. The load cell's
+free-air reading is subtracted: the head's weight on it changes with the wand's tilt.
 """
 
 from collections import deque
@@ -17,18 +17,17 @@ from touchgoal.control.tactile.gel_wear import GelWear, find_wear
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.control.wand_touch import CLIP, FORCE_RANGES, MAX_FORCE, WandTouch, force_range
 
-_CONTACT = 0.3  # N over what the load cell reads in free air; an HX711's noise is 0.005
+_CONTACT = 0.3  # N above the free-air reading; an HX711's noise is 0.005
 _LEAST_FORCE = 0.5  # N of a touch
-_BEFORE = 25  # moments, 1 s of a Mini: so long before contact a hand is some centimetres away
+_BEFORE = 25  # moments, 1 s of a Mini: then the wand is still centimetres from the object
 _SETTLING = 12  # moments without a change, after a touch or at the start
 _PART = 5  # first and last of them that are compared
 _SETTLED = 1.5  # counts of local change between their medians; a compressed stream is never still
-_LASTING = 10  # moments at which gel and load cell disagree before it is said
-_TURNED = (
-    0.02  # of a force without a touch that a moment takes for the head's weight: it was turned
-)
+_LASTING = 10  # moments of disagreement between gel and load cell before the hint says so
+# Share by which the free-air reading follows a force without a touch, each moment: the wand was tilted.
+_TURNED = 0.02
 _HELD = 5  # moments near the largest force
-_NEAR = 0.1  # below the largest force, as a share, that counts as near
+_NEAR = 0.1  # share below the largest force that counts as near
 _LONGEST = 250  # moments of a touch
 
 
@@ -45,19 +44,19 @@ class WandRecorder:
     def __init__(
         self, sensor: SensorModel, first: Picture | None = None, counts: tuple[int, ...] = (0, 0, 0)
     ) -> None:
-        """`first`: this gel's first untouched picture, None for a new one; `counts`: touches a range."""
+        """`first`: first untouched picture of this gel, None if new; `counts`: touches per range."""
         self.hint, self.force = "leave the gel untouched", 0.0
         self.counts = list(counts)
         self.wear: GelWear | None = None
         self._sensor, self._first = sensor, first
         self._free: deque[Moment] = deque(maxlen=_BEFORE)  # untouched, since the last touch
         self._detector: ContactDetector | None = None  # None until the gel has settled
-        self._air = 0.0  # what the load cell reads in free air, N
+        self._air = 0.0  # the load cell's free-air reading, N
         self._press: list[tuple[Picture, float]] = []
         self._disagreed = 0  # moments in a row at which gel and load cell disagree
         self._before: Moment | None = None
         self._peak: Moment | None = None
-        self._made: WandTouch | None = None  # until the gel has been looked at
+        self._made: WandTouch | None = None  # a finished touch, until the gel has been checked
 
     def update(self, moment: Moment) -> WandTouch | str | None:
         """Process the next moment; return a touch when the gel has settled after it.
@@ -83,7 +82,7 @@ class WandRecorder:
         return None
 
     def _disagree(self, touching: bool) -> None:
-        """Say which device shows nothing, when it has lasted."""
+        """Hint at the device that shows no touch, once the disagreement has lasted."""
         self._disagreed += 1
         if touching:
             advice = "press harder, or let go: the gel is touched, but the load cell reads nothing"
@@ -180,7 +179,7 @@ class WandRecorder:
         self._free.clear()
 
     def _wanted(self) -> str:
-        """Name the range of which there are fewest touches."""
+        """Name the force range with the fewest touches."""
         low, high = FORCE_RANGES[int(np.argmin(self.counts))]
         done = ", ".join(
             f"{n} of {a:g}-{b:g} N" for n, (a, b) in zip(self.counts, FORCE_RANGES, strict=True)
@@ -189,11 +188,11 @@ class WandRecorder:
 
 
 def evenly_loaded(forces: Float[np.ndarray, " n"], count: int) -> list[int]:
-    """Choose `count` of at least as many moments, in order, whose forces rise evenly to the last."""
+    """Return the indices of `count` moments, in order, whose forces rise evenly to the last one."""
     chosen: list[int] = []
     for k in range(1, count):
         first = chosen[-1] + 1 if chosen else 0
-        last = len(forces) - (count - k)  # leaves one each for those that follow
+        last = len(forces) - (count - k)  # leaves one moment for each later choice
         aim = forces[-1] * k / count
         chosen.append(first + int(np.abs(forces[first:last] - aim).argmin()))
     return [*chosen, len(forces) - 1]

@@ -17,7 +17,7 @@ from touchgoal.control.motion.tracker import ServoLag
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.runtime.errors import UserError
 
-_SIMULATED_PLAN_TIMEOUT = 20.0  # s for which a simulated arm's time stands still for a plan
+_SIMULATED_PLAN_TIMEOUT = 20.0  # s of wall time that a simulated arm waits for a plan
 SCRIPTED = ("expert", "follower")
 """Names of the actors without a policy."""
 
@@ -75,7 +75,7 @@ def make_actor(
 ) -> Actor:
     """Return the actor for one run, from where the arm is now."""
     if policy is not None:
-        # So a run on a simulated arm repeats on any machine.
+        # Waiting makes a run on a simulated arm repeatable on any machine.
         timeout = _SIMULATED_PLAN_TIMEOUT if cell.time_waits else None
         return RealTimeActor(policy.planner, timeout, ServoLag(safety.limits, safety.dt))
     if cell.task.policy == "follower":

@@ -96,7 +96,7 @@ class RunLog:
 
     # observation and command of each tick, by key
     rows: list[dict[str, np.ndarray]] = field(default_factory=list)
-    # lateness, answer_times: s by which each tick began too late, and that the actor took
+    # lateness, answer_times: s by which each tick began late, and s that the actor took
     lateness: list[float] = field(default_factory=list)
     answer_times: list[float] = field(default_factory=list)
     limit_counts: dict[str, int] = field(default_factory=dict)  # commands changed, by limit
@@ -176,7 +176,7 @@ class ControlLoop:
                 return self._loop(actor, seconds, log)
         except (DriverError, UserError) as error:
             return self._arm_first(self.stop(str(error), "check what it names, then start again"))
-        except Exception as error:  # the policy's, most likely; the arm must not go on
+        except Exception as error:  # most likely the policy's error; stop the arm in any case
             message, origin = " ".join(str(error).split()), extract_tb(error.__traceback__)[-1]
             where = f"{Path(origin.filename).name} line {origin.lineno}"
             return self.stop(
@@ -216,7 +216,7 @@ class ControlLoop:
         arm, clock = self._connection.arm, self._connection.clock
         began, end = clock.now(), time.monotonic() + _REST_WALL_TIMEOUT
         arm.stop()
-        with suppress(DriverError):  # of a lost gripper; the arm is what matters
+        with suppress(DriverError):  # a lost gripper must not keep the arm from being watched
             self._connection.gripper.stop(release_to)
         rest, last = np.inf, arm.read()
         while clock.now() - began < _REST_TIMEOUT and time.monotonic() < end:
@@ -229,7 +229,7 @@ class ControlLoop:
         return Ending(reason, False, True, advice, rest)
 
     def _arm_first(self, ending: Ending) -> Ending:
-        """Put the arm's own fault first, if it has one by now: it takes other devices along."""
+        """Name the arm's own fault first, if it has one: it often makes other devices fail, too."""
         fault = self._connection.arm.read().fault
         if not fault or fault.startswith(STOPPED_ON_REQUEST) or fault in ending.reason:
             return ending
@@ -313,7 +313,7 @@ class ControlLoop:
             reason += f" s ({self.reader.unsound})"
         release_to = None
         if fault.limit == Limit.INDENTATION and not self._held.carried:
-            # Open by as much as both gels give way; a carried object would fall.
+            # Open by the ceiling of both gels, unless an object is carried: it would fall.
             width = reading.gripper.width + 2 * self._safety.limits.indentation
             release_to = min(width, self._safety.limits.tool.stroke[1])
         advice = ADVICE.get(fault.limit, "look at what it names")
@@ -334,7 +334,7 @@ class ControlLoop:
 
 
 def slow_arm(pace: float) -> str:
-    """Say what to do about an arm whose clock goes at this share of real time."""
+    """Return advice on an arm whose clock runs at this share of real time."""
     return (
         f"the arm's clock goes at {pace:.2f} of real time: this twin cannot keep up, and "
         "everything comes late in its time; free the machine, or start it with --lock-step"

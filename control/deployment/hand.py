@@ -41,7 +41,7 @@ class HeldObject:
         held = self._held_ticks >= _CONFIRMING
         closing = commanded <= self._width
         if held and closing and gripper.width > self._width - _SLIPPED:
-            return  # a driver that reports motion for a moment
+            return  # a driver may report motion for a moment
         self.lost = self.lost or (held and closing)
         self._held_ticks, self.carried = 0, False
 

@@ -30,7 +30,7 @@ class CellReading:
     """Readings of one tick."""
 
     observation: dict[str, np.ndarray]  # by the keys of `control/features.py`
-    # arm, gripper: the last ones without NaN, with their own stamps, so that ages tell
+    # arm, gripper: the last readings without NaN, with their own stamps, so that ages show it
     arm: ArmReading
     gripper: GripperReading
     load: LoadReading | None  # of the load cell; None without one
@@ -72,7 +72,7 @@ class ObservationReader:
     def read(self) -> CellReading:
         """Return the newest readings; DriverError if a device broke for good."""
         connection = self._connection
-        arm, gripper = self._sound(connection.arm.read(), connection.gripper.read())
+        arm, gripper = self._without_nan(connection.arm.read(), connection.gripper.read())
         frames = {key: camera.read() for key, camera in connection.cameras.items()}
         load = connection.load_cell.read() if connection.load_cell else None
         ages = {key: connection.clock.age(frame.stamp) for key, frame in frames.items()}
@@ -90,7 +90,9 @@ class ObservationReader:
         age, indentation = ages.get(oldest, 0.0), self._indentation(frames)
         return CellReading(observation, arm, gripper, load, age, oldest, indentation, fault)
 
-    def _sound(self, arm: ArmReading, gripper: GripperReading) -> tuple[ArmReading, GripperReading]:
+    def _without_nan(
+        self, arm: ArmReading, gripper: GripperReading
+    ) -> tuple[ArmReading, GripperReading]:
         """Return the newest readings without NaN; faults are always the newest."""
         parts = {
             "joint positions": arm.q,

@@ -25,7 +25,7 @@ from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime.errors import CheckResult, UserError
 
-_MIN_RATE_SHARE = 0.8  # of what the cell says of a camera
+_MIN_RATE_SHARE = 0.8  # share of the camera rate that the cell file states
 # Counts by which a fingertip may differ from its sensor file's. Simulated units differ by 1 to 2, a
 # grasp makes 20 and more; real units differ by more than simulated ones (unmeasured here).
 _TOUCHED_COUNTS = 12.0
@@ -191,7 +191,7 @@ def _camera(camera: Camera, rate: float, nominal: float, gripper: Gripper) -> st
 def _fingertip(camera: TactileSensor) -> tuple[Picture, Picture]:
     """Return a fingertip's image and its sensor file's background, both without dots."""
     frame, model = camera.read().image, camera.model
-    if model.markers is not None:  # every unit's dots lie elsewhere
+    if model.markers is not None:  # the dots' places differ from unit to unit
         dots = find_markers(frame, model.markers, model.pixel_pitch)
         frame = without_markers(frame, dots.positions, dots.largest_radius(model.markers))
     return frame, load(model.sensor_file).background

@@ -21,8 +21,8 @@ _CLOSE_TIMEOUT = 2.0  # s for a plan under way when the episode ends
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    tick: int  # of its observation, at which its first action belongs
-    end: int  # from here on the next plan is wanted
+    tick: int  # tick of its observation, and of its first action
+    end: int  # first tick of the next plan
     actions: Float32[np.ndarray, "h 8"]
 
 
@@ -60,12 +60,12 @@ class ChunkPlanner(Protocol):
 class RealTimeActor(Actor):
     """Actor that answers at once from the newest plan, while a thread makes the next one.
 
-    A plan is used from the tick after its observation's, and asked for that much earlier: it has a
-    whole tick to be made, and actions do not depend on the machine's speed. Action k belongs to the
-    tick k after the observation, so a late plan makes no jump; if plans run out the arm stands
-    still. A plan no longer than its executed part is asked for when needed. An arm that follows at
-    once, unlike the servo that a policy has learned on, answers its corrections too soon: `lag`
-    restores that delay, and what it has not passed on yet counts as commanded.
+    A plan is used from the tick after its observation's. It is requested one tick early, so that it
+    has a whole tick to be made and actions do not depend on the machine's speed. Action k belongs
+    to the tick k after the observation, so a late plan makes no jump; if plans run out the arm
+    stands still. A plan no longer than its executed part is requested only when needed. An arm that
+    follows at once reacts sooner than the servo that the policy was trained on: `lag` restores the
+    servo's delay. Joint changes that `lag` still holds back count as commanded.
     """
 
     def __init__(
@@ -73,11 +73,13 @@ class RealTimeActor(Actor):
     ) -> None:
         """Begin an episode of the planner; `close` ends the thread.
 
-        `timeout` is how long a plan that should be there is waited for, s; None: half a tick.
+        `timeout` is the time to wait for a late plan, s; None: half a tick.
         """
         self._planner, self._config = planner, planner.config
-        self.latencies: list[float] = []  # s from an observation to its plan, but the first's
-        self.late_plans = self.ticks_without_plan = 0  # ticks whose own plan, or any, was not there
+        # s from an observation to its plan, without the first plan
+        self.latencies: list[float] = []
+        # plans that were late; ticks without any plan
+        self.late_plans = self.ticks_without_plan = 0
         self._lag = lag
         self._before: np.ndarray | None = None  # joints (rad) wanted at the last tick
         self.failure: BaseException | None = None  # ended the planning thread; `act` raises it
@@ -107,7 +109,7 @@ class RealTimeActor(Actor):
                 raise self.failure
 
     def act(self, observation: Observation) -> Float[np.ndarray, "8"]:
-        """Return the action for this tick, as late as the servo passes it on."""
+        """Return the action for this tick, delayed by `lag`."""
         if self._lag is None:
             return self._answer(observation)
         q = observation[ft.COMMAND][: ft.N_JOINTS] + self._lag.remaining
@@ -131,7 +133,7 @@ class RealTimeActor(Actor):
         with self._condition:
             self._tick += 1
             self._history = [*self._history[1:], observation]
-            if self._request:  # its plan was meant for this tick
+            if self._request:  # the requested plan is due at this tick
                 self._condition.wait_for(self._no_request, self._timeout)
                 self.late_plans += self._request is not None
             if self._request is None and self._due():
@@ -176,7 +178,7 @@ class RealTimeActor(Actor):
                 self._condition.notify_all()
 
     def _take(self, request: _Request, actions: Float32[np.ndarray, "h 8"]) -> None:
-        """Hand a finished plan over."""
+        """Store a finished plan for `act`."""
         horizon = self._config.execution_horizon
         with self._condition:
             end = request.tick + horizon

@@ -20,15 +20,16 @@ from touchgoal.control.motion.trajectories import (
 )
 from touchgoal.control.safety.action_filter import ActionFilter
 
-_SPEED_SHARE = 0.9  # of what the safety layer lets a policy do: a plan should not be clamped
-_START_SPEED_SHARE = 0.3  # of that, for the start move: a person watches where it goes
+_SPEED_SHARE = 0.9  # share of the policy's limits: a plan should not be clamped
+# share of the policy's limits, for the start move: slow for the person who watches
+_START_SPEED_SHARE = 0.3
 _HELD_ERROR = 0.02  # rad; the arm was held: the plan waits until it has caught up
 _MAX_LAG = 0.12  # rad between command and arm beyond which the plan waits; 0.06 is usual
-_GRIPPER_MOVES = 5e-4  # m a tick, the least of a moving gripper
+_GRIPPER_MOVES = 5e-4  # m a tick; a gripper that moves less stands still
 _CLEARANCE = 0.12  # m above the object before and after the grasp
 _OFF_THE_FLOOR = 0.002, 0.0007  # m that fingertips keep above their box's floor: grasping, placing
 _PROBE_DEPTH = 0.004  # m below the grasp's height to look for the table
-_TABLE_FORCE = 2.5  # N upwards, more than while it was carried, that mean the table carries it
+_TABLE_FORCE = 2.5  # N upwards beyond the carried weight: the table carries the object
 _CLOSE_SECONDS, _PROBE_SECONDS, _HOLD_SECONDS = 1.0, 3.0, 0.8  # closing, probing the table, end
 
 
@@ -74,12 +75,12 @@ class ScriptedActor(Actor):
             width, t, weight = move.width, 0.0, self._wrench[2]
             while t < move.seconds:
                 if move.until_supported and self._wrench[2] - weight > _TABLE_FORCE:
-                    # Command what is, not what was asked: the lag would press on the table.
+                    # Command the measured joints: the commanded ones would press on the table.
                     yield np.append(self._measured - self._commanded(), width)
                     break
                 wanted = still
                 lag = np.abs(self._commanded() - self._measured).max()
-                if move.path is None:  # seconds in which nothing moves
+                if move.path is None:  # a wait: counts only while nothing moves
                     t = t + self._tick if self._gripper_still and lag < _HELD_ERROR else 0.0
                 else:
                     pace = move.path.duration / move.seconds

@@ -78,7 +78,7 @@ class Session:
 
         UserError or DriverError if it cannot begin; nothing has moved then.
         """
-        # Scripts end by themselves; of other actors only a simulator knows when the task is done.
+        # Scripts end by themselves; for other actors only a simulator knows when the task is done.
         scripted = self.cell.task.policy == "expert"
         truth = None if scripted else self.connection.truth
         watch, log = _SuccessWatch(truth, self.cell.time_waits), RunLog()

@@ -33,7 +33,7 @@ def say(text: str) -> None:
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # for whatever flushes it later
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # for later flushes of stdout
         print(text, file=sys.stderr, flush=True)
 
 

@@ -100,7 +100,7 @@ class UserPolicy:
     given: Any = None  # the class or an object of it; None: it is imported by its name
 
     def __call__(self, env: Any = None) -> CheckedPolicy:
-        """Make one at an episode's beginning, for the environment's robot or else an FR3."""
+        """Make the policy of one episode, for the environment's robot, or an FR3 without one."""
         n_joints = ft.N_JOINTS if env is None else env.n_joints
         policy = CheckedPolicy(self._make(), self.name, n_joints)
         policy.reset()

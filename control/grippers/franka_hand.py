@@ -27,7 +27,7 @@ class FrankaHandClient:
         """Connect; with `lock_step` the hand advances only when `advance` is called."""
         self.period = NEVER if lock_step else PERIOD
         self._issued = 0  # commands sent to the hand
-        self._answered: int | None = None  # of them, by a twin's count
+        self._answered: int | None = None  # commands that a twin says it has answered
         self._franky, self._force = FRANKY.load("franky"), force
         self._hand = self._franky.Gripper(address)
         self._max_width = self._hand.state.max_width
@@ -160,7 +160,7 @@ class NonBlockingGripper:
         self._wanted = width
 
     def stop(self, release_to: float | None = None) -> None:
-        """See Gripper. No width that was read before is sent after it: both hold the lock."""
+        """See Gripper. Both hold the lock, so that no earlier width is sent after the stop."""
         with self._lock:
             self._stopped = True
             self._gripper.stop(release_to)

@@ -1,9 +1,9 @@
 """Commands of a Franka Hand, shared by its driver and by the environment that trains for it.
 
 The hand takes one slow command at a time (0.8 s at most), while a policy asks for a width every
-tick. When one has ended the newest width is sent, unless it only passes on the way to another,
-faster than the hand could follow. Only closing all the way is a grasp, which ends at an object of
-any width; an inward move that meets one becomes a grasp of it.
+tick. When a command has ended, the newest width is sent, unless the target is still changing faster
+than the hand can move. Only closing all the way is sent as a grasp, which ends at an object of any
+width; an inward move that meets an object is followed by a grasp.
 """
 
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from typing import Literal
 
 PERIOD = 0.05  # s between looks at the hand
 SPEED = 0.1  # m/s; the hand's fastest
-SHUT = 2e-3  # m between commands that differ, and up to which a width is shut
-_MOST_PASSING = 3  # looks in a row for which widths may pass
+SHUT = 2e-3  # m: least change of width that is sent; narrower targets are grasps
+_MOST_PASSING = 3  # looks in a row that a changing target is waited for
 
 LastCommand = Literal["runs", "arrived", "stopped short"]
 """State of the last command; "arrived" before the first."""
@@ -32,8 +32,8 @@ class HandCommands:
     def __init__(self, width: float) -> None:
         """Begin with the hand at rest at that width (m)."""
         self._sent = self._last_target = width
-        self._moves_inwards = False  # the last command
-        self._passing = 0  # looks for which widths have passed
+        self._moves_inwards = False  # whether the last command was an inward move
+        self._passing = 0  # looks in a row with a changing target
 
     def next(
         self, target: float, width: float, grasped: bool, last: LastCommand
@@ -57,7 +57,7 @@ class HandCommands:
         return HandCommand(target, grasp=target <= SHUT)
 
     def _passes(self, target: float) -> bool:
-        """Return whether the target only passes, faster than the hand could follow."""
+        """Return whether the target still changes faster than the hand can move."""
         changed, self._last_target = abs(target - self._last_target), target
         passes = target > SHUT and changed > SPEED * PERIOD
         self._passing = self._passing + 1 if passes else 0

@@ -19,14 +19,15 @@ from touchgoal.runtime.errors import UserError
 # m^2: makes steps finite at a singularity. The squared error is added to it, so that a step from afar
 # goes no farther than the linearisation holds (Sugihara 2011).
 DAMPING = 1e-6
-_TASK_STEP = 0.1, 0.5  # m and rad, farthest that a step goes
+_TASK_STEP = 0.1, 0.5  # m and rad, longest step
 _MARGIN = 1e-4  # rad that solutions keep from the joints' limits
 _ITERATIONS = 50
-_PULLED = 8  # of them draw the arm towards its home, ever less; then nothing disturbs the end
+_PULLED = 8  # first iterations, in which the pull towards home fades to zero
 # Other starts. Of 1,000 poses in reach with any rotation, 66 % (FR3) and 54 % (UR5e) are found from home,
 # 100 % and 99.9 % with these.
 _RESTARTS = 48
-_ERROR_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])  # squared: 10 mrad as 1 mm
+# of squared errors: 10 mrad count as 1 mm
+_ERROR_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
 
 
 def _rotation(axis: str, angle: casadi.SX | float) -> casadi.SX:
@@ -59,7 +60,7 @@ def _step(arm: ArmModel, tcp_offset: float) -> casadi.Function:
     """Return the CasADi function of one step of damped least squares; one call takes 6 us.
 
     (q, target position and rotation by rows (12), posture, free, held) -> change of q, pose error
-    of q (6: m, rad). Joints where `free` is 0 change by `held` (rad), the others do the rest.
+    of q (6: m, rad). Joints where `free` is 0 change by `held` (rad); the others solve the task.
     """
     n = len(arm.links)
     q, target, posture, free, held = (
@@ -74,7 +75,7 @@ def _step(arm: ArmModel, tcp_offset: float) -> casadi.Function:
     task = casadi.fmin(casadi.fmax(error, -bound), bound)
     damping = DAMPING + casadi.dot(casadi.DM(_ERROR_WEIGHTS), error**2)
     given = free * posture * (arm.home - q) + (1 - free) * held
-    # Least squares for what the pull leaves to do is the pull's part in the null space, and the task.
+    # Solving for the error that remains after `given` keeps only the null-space part of `given`.
     Jf = J @ casadi.diag(free)
     factors = casadi.ldl(Jf @ Jf.T + damping * casadi.SX.eye(6))
     change = given + Jf.T @ casadi.ldl_solve(task - J @ given, *factors)
@@ -162,10 +163,10 @@ class Kinematics:
     ) -> IkSolution:
         """Solve by damped least squares from `start`, near which the solution lies.
 
-        A joint that would leave its range is held at its end, and the others do the rest. An arm
-        with more than six joints is drawn to its home by `posture` (a share of the way a step), so
-        that the elbow stays where a person expects it; 0 moves the joints least. It stops within
-        `tolerance` m and ten times that in rad, or after the last iteration.
+        A joint that would leave its range is held at its limit, and the others solve the task. With
+        more than six joints, each step pulls the arm home by the share `posture`, so that the elbow
+        stays where a person expects it; with 0 the joints move least. It stops within `tolerance` m
+        and ten times that in rad, or after the last iteration.
         """
         reach = self.arm.limits.with_margin(_MARGIN)
         lower, upper = reach.lower, reach.upper

@@ -2,9 +2,9 @@
 path.
 
 A reference walks in straight lines from target to target, each within the policy's period, or
-slower where it would turn faster than the limits allow. The command is its mean over a short
-window, which keeps its range and delays all joints alike: it cuts corners (`touchgoal benchmark
-sent-stream`), near the path that the safety layer has checked.
+slower where it would turn faster than the limits allow. The command is the reference's mean over a
+short window: it stays in the reference's range and delays all joints alike. It cuts corners, by how
+much says `touchgoal benchmark sent-stream`.
 """
 
 from dataclasses import dataclass, replace
@@ -19,10 +19,10 @@ from touchgoal.control.safety.limits import RobotLimits
 
 Joints = Float[np.ndarray, "n"]
 
-SERVO_DAMPING = 0.1  # s: N m s/rad for each N m/rad of stiffness, as in Franka's fr3.xml
-_RESERVE = 1.1  # times the targets' pace that the reference may reach, to make up for late ones
+SERVO_DAMPING = 0.1  # s: damping over stiffness, as in Franka's fr3.xml
+_RESERVE = 1.1  # factor on the targets' pace by which the reference may catch up
 _ROUNDING = 1e-12  # rad
-_MOST = 8  # targets on the way; more come from a clock that is not the policy's, and are cut short
+_MOST = 8  # queued targets; more mean a clock faster than the policy's: the queue is dropped
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,7 @@ class TrackerState:
     """One millisecond of the tracker."""
 
     q: Joints  # commanded joint positions, rad
-    # targets, step: of the reference, the next first, and in a millisecond at the targets' pace,
-    # rad
+    # targets: the reference's next ones, rad; step: its motion in a millisecond at their pace, rad
     targets: Float[np.ndarray, "k n"]
     step: Joints
     window: Float[np.ndarray, "m n"]  # the reference's last positions, oldest first, rad
@@ -40,9 +39,9 @@ class TrackerState:
 class Tracker:
     """Tracker inside `limits` for targets every `period` s; `dt` s is the interface's tick.
 
-    Give it `RobotLimits.interface`, and as `speed` (rad/s) the highest of the targets,
-    `RobotLimits.policy`'s; beyond a tenth above it the reference falls behind. `lag` is that of the
-    command behind the reference, s.
+    Pass `RobotLimits.interface`, and as `speed` (rad/s) the highest speed of targets,
+    `RobotLimits.policy`'s; with targets over a tenth faster the reference falls behind. `lag` is
+    the delay of the command behind the reference, s.
     """
 
     def __init__(self, limits: JointLimits, speed: Joints, period: float, dt: float = 1e-3) -> None:
@@ -55,7 +54,8 @@ class Tracker:
         k = max(1, int(np.ceil((2 * limits.acceleration / limits.jerk / dt).max())))
         self._weights = np.convolve(np.full(self._m, 1 / self._m), np.full(k, 1 / k))
         self.lag = (self._weights.size - 1) / 2 * dt
-        self._reach = limits.acceleration * self._m * dt**2  # rad a tick that may be gained or lost
+        # rad a tick: largest change of the reference's step over the window
+        self._reach = limits.acceleration * self._m * dt**2
         self._fastest = np.minimum(limits.velocity * dt, self._reach)
         self.step(self.start(speed))  # compiles now, not in a loop
 
@@ -110,7 +110,8 @@ def _step(targets, step, window, weights, m, reach, fastest, ticks):
     """Return the command, the remaining targets, the reference's step and its window."""
     reference = window[-1].copy()
     if len(targets):
-        pace = float(len(targets))  # steps that the reference may go, its mean within the limits
+        # steps that the reference may go while its mean stays in the limits
+        pace = float(len(targets))
         for i in range(step.size):
             if step[i] != 0:
                 before = window[-m, i] - window[-m - 1, i]

@@ -34,8 +34,8 @@ Times = Float[np.ndarray, " k"]
 class Timing:
     """Share of a path walked over time, in pieces of constant jerk.
 
-    `starts` are of the pieces, then the end, s; `rates` are share, speed, acceleration and jerk
-    there, per s^0 to s^3.
+    `starts` (s) are the beginnings of the pieces, then the end; `rates` are the share and its first
+    three derivatives there (1/s, 1/s^2, 1/s^3).
     """
 
     starts: Float[np.ndarray, " m"]
@@ -45,8 +45,9 @@ class Timing:
     def fastest(
         cls, speed: float, acceleration: float, deceleration: float, jerk: float
     ) -> "Timing":
-        """Return the fastest from rest to rest inside these limits of the share, by Ruckig."""
-        unit = jerk ** (-1 / 3)  # s, in which jerk is 1: limits of very short paths are huge
+        """Return Ruckig's fastest rest-to-rest profile within limits of the share's derivatives."""
+        # s; in this unit jerk is 1, because the limits of very short paths are huge
+        unit = jerk ** (-1 / 3)
         wanted, found = ruckig.InputParameter(1), ruckig.Trajectory(1)
         wanted.current_position, wanted.target_position = [0.0], [1.0]
         wanted.max_velocity, wanted.max_jerk = [speed * unit], [1.0]
@@ -122,7 +123,7 @@ def straight_line(
     nodes = -np.cos(np.pi * np.arange(_DEGREE + 1) / _DEGREE)
     q = [np.asarray(start, dtype=np.float64)]
     for s in (nodes[1:] + 1) / 2:
-        solution = kinematics.solve_ik_near(  # least motion, to rounding: noise would show as jerk
+        solution = kinematics.solve_ik_near(  # least motion, exactly: noise would show as jerk
             origin + s * (position - origin),
             rotation_matrix(s * turn) @ turned,
             q[-1],

@@ -1,8 +1,8 @@
 """The safety layer: every commanded joint change is clamped, every fault stops the arm for good.
 
 Pure: a state goes in, a new one comes out. It keeps one invariant: from where the command is,
-braking stops inside every limit. A tick takes the policy's command only as far as that stays true
-of the next one; otherwise it brakes along the path already checked.
+braking stops inside every limit. A tick follows the policy's command only as far as this holds for
+the next command, too; otherwise it brakes along the path already checked.
 """
 
 from collections.abc import Callable
@@ -114,10 +114,10 @@ class SafetyState:
     mode: Mode = Mode.HOLD
     active_limits: tuple[Limit, ...] = ()  # limits that changed the command this tick
     fault: Fault | None = None  # the first fault; it stays
-    bad_actions: int = 0  # ticks since the last action of finite numbers
+    bad_actions: int = 0  # ticks since the last finite action
 
 
-# Shares of the way from braking to the wanted command that are tried where that is too much.
+# Shares of the way from braking to the wanted command, tried in turn if that is not allowed.
 _SHARES = np.array([0.8, 0.6, 0.4, 0.2])
 _ROUNDING = 1e-12  # rad/s; a smaller change is no clamp
 
@@ -252,10 +252,10 @@ class ActionFilter:
         velocity = clamp(
             velocity, state.velocity - reach, state.velocity + reach, Limit.ACCELERATION
         )
-        slower = self._as_much(state, velocity, self._slow_enough)
+        slower = self._allowed_velocity(state, velocity, self._slow_enough)
         if slower is not velocity:
             active_limits.append(Limit.TIP_SPEED)
-        safe = self._as_much(state, slower, self._stops_inside)
+        safe = self._allowed_velocity(state, slower, self._stops_inside)
         if safe is not slower:
             active_limits.append(Limit.WORKSPACE)
         q = state.q + safe * dt
@@ -263,8 +263,8 @@ class ActionFilter:
             state, q=q, velocity=safe, mode=Mode.MOVE, active_limits=tuple(active_limits)
         )
 
-    def _as_much(self, state: SafetyState, wanted: Joints, allows: Allows) -> Joints:
-        """Return as much of the wanted velocity, beyond braking, as is allowed; at least braking."""
+    def _allowed_velocity(self, state: SafetyState, wanted: Joints, allows: Allows) -> Joints:
+        """Return the allowed velocity nearest to the wanted one, on the way to it from braking."""
         if allows(state.q, wanted[None])[0]:
             return wanted
         rest = braked_velocity(state.velocity, self.joints.acceleration, self.dt)

@@ -90,7 +90,7 @@ UR5E = RobotLimits(UR5E_ARM, ROBOTIQ_2F85, _FLANGE, _FINGERTIPS)
 
 
 # Force ceilings of a task lie above what its demonstrations reach, below the arm's reflex.
-_CEILING_MARGIN = 1.5  # by which a ceiling lies above what demonstrations reach
+_CEILING_MARGIN = 1.5  # factor on what demonstrations reach
 _MOST = 28.0  # N: the arm is stopped before it stops itself, an FR3 at 30 N (`arms/franka.py`)
 _LEVER = 0.6  # m: farthest that a hand over the table is from the axis of a joint that lifts it
 
@@ -119,12 +119,12 @@ class TaskForces:
 
     @property
     def indentation_ceiling(self) -> float:
-        """Depth (m) in a gel, likewise; `deepest_readable` bounds it for a sensor."""
+        """Depth (m) in a gel that stops a run; `deepest_readable` bounds it for a sensor."""
         return _CEILING_MARGIN * self.indentation
 
 
 # By `touchgoal benchmark task-ceilings`: 60 episodes of pick-place, and 60 with --feedback; 29 of the maze with
-# the bead led astray at 4 mm/s, and for its indentation the first six without.
+# a disturbance of 4 mm/s for the force, and six without for the indentation.
 TASK_FORCES: dict[str, TaskForces] = {
     "pick-place": TaskForces(force=16.5, indentation=2.1e-3, episodes=120),
     "bead-maze": TaskForces(force=17.9, indentation=1.15e-3, episodes=29),

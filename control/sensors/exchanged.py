@@ -6,10 +6,10 @@ import numpy as np
 from touchgoal.control.arrays import Picture
 from touchgoal.control.tactile.background import local_change
 
-_CLEARLY = 1.5  # times that a fingertip is more like the other's sensor file
+_CLEARLY = 1.5  # factor by which a fingertip must be more like the other's sensor file
 _SMALL = 32  # px of a side at which pictures of cameras are compared
-_MOVED = 2.5  # counts by which half of a picture changes at least, when its camera has moved
-_TIMES = 3.0  # that the other one's must change less
+_MOVED = 2.5  # counts: median change of a picture whose camera has moved, at least
+_TIMES = 3.0  # factor by which the other camera's picture must change less
 
 
 def fingertips_exchanged(
@@ -32,12 +32,12 @@ def cameras_exchanged(front: tuple[Picture, Picture], wrist: tuple[Picture, Pict
 
     False for a view without structure; the pictures are from before and after a move of the arm.
     """
-    moved = _usual_change(*front)
-    return moved > _MOVED and moved > _TIMES * _usual_change(*wrist)
+    moved = _median_change(*front)
+    return moved > _MOVED and moved > _TIMES * _median_change(*wrist)
 
 
-def _usual_change(before: Picture, after: Picture) -> float:
-    """Return the median change of the pixels, counts, beyond a factor on all (exposure)."""
+def _median_change(before: Picture, after: Picture) -> float:
+    """Return the median change of the pixels after a common gain (exposure), counts."""
     size = _SMALL, _SMALL
     small = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (before, after)]
     first, second = (x.astype(np.float32) for x in small)

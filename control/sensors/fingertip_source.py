@@ -25,7 +25,7 @@ from touchgoal.runtime.option_types import Corners
 from touchgoal.runtime.picture_file import read_picture
 
 _PICTURES = (".png", ".jpg", ".jpeg")
-_UNTOUCHED = "background.png"  # of a folder of presses: what the sensor shows before them
+_UNTOUCHED = "background.png"  # untouched sensor of a folder of presses
 _POLL_INTERVAL = 0.005  # s between looks for a new frame
 _TIMEOUT = 5.0  # s without any
 

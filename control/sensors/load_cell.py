@@ -23,7 +23,7 @@ from touchgoal.runtime.option_types import STRICT
 Checksum = Literal["none", "xor", "crc16"]
 
 _MAX_LINE_LENGTH = 256  # bytes of a line
-_RESTARTED = 10  # lines with a clock that goes forwards, but behind the newest, that mean a restart
+_RESTARTED = 10  # lines in a row, with a rising clock behind the newest one, that mean a restart
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=STRICT)
@@ -134,7 +134,7 @@ class SerialLoadCell:
         if sample.clock is None:
             return True
         before, last, self._last = self._clock, self._last, sample.clock
-        # Behind what it was, line by line forwards: the microcontroller has begun anew.
+        # A clock that rises, but is behind its latest value: the microcontroller has restarted.
         self._behind = self._behind + 1 if last < sample.clock <= before else 0
         if self._behind >= _RESTARTED:
             before = self._clock = last

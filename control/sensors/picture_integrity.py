@@ -11,8 +11,8 @@ from touchgoal.control.arrays import Picture
 
 _STRICT = "explode+crccheck+bitstream+buffer"
 _BLOCK = 8  # px of JPEG
-_JUMPS = 5  # the largest so many count: one block has four sides
-_USUAL = 2.0  # times by which the largest exceed what is usual, in a coarse picture that is whole
+_JUMPS = 5  # number of the largest jumps that are averaged: one block has four sides
+_USUAL = 2.0  # largest over median jump in an intact, coarse JPEG
 _SMOOTH = 3.5  # counts; real and simulated pictures at JPEG quality 75 and above stay below 3.4
 _MEASURED = 5  # px of a block's side that must lie clear of dots for it to count
 _DOT = 8.0  # px across, to which pictures with larger dots are scaled down to find them
@@ -20,10 +20,10 @@ _WIDER = 1.6  # diameters that a dark spot may be wide and count as a dot
 _RIM = 0.25  # diameters around a dot that count as part of it
 _DARKER = 0.12  # of the usual brightness by which a dot is darker
 _ALL_CHANNELS = np.ones((1, 3))  # their sum
-_BANDS = 8  # that a picture is cut into to look for frozen parts
-_STRIDE = 4  # pixels; every so many are compared
-_LEARNING = 20  # pictures that show which bands change all the time, by sensor noise
-_LIVELY = 0.8  # share of those in which they must
+_BANDS = 8  # bands of a picture, checked for frozen parts
+_STRIDE = 4  # pixels between those compared
+_LEARNING = 20  # first pictures, which show the bands that sensor noise changes
+_LIVELY = 0.8  # share of them in which a band must change to be watched
 
 
 class JpegDecoder:
@@ -75,7 +75,7 @@ class BrokenBlocks:
 def _jumps_at_blocks(
     change: Int16[np.ndarray, "h w"], clear: Bool[np.ndarray, "h w"] | None
 ) -> float:
-    """Return the extra jump of a change between JPEG blocks, counts."""
+    """Return by how much a change jumps more between JPEG blocks than within, counts."""
     worst = 0.0
     for turned in (False, True):
         grey = np.ascontiguousarray(change.T) if turned else change

@@ -120,8 +120,7 @@ def rectify(image: Picture, shape: tuple[int, int], corners: Corners) -> UInt8[n
     given = np.array(corners, np.float32)
     _check_corners(given, image.shape[:2])
     rows, columns = shape
-    # Larger than asked for where the camera shows more, so that its pixels are averaged, not left
-    # out.
+    # First at the camera's resolution, then reduced, so that pixels are averaged, not skipped.
     finer = max(1, round(float(np.linalg.norm(given[1] - given[0])) / columns))
     high, wide = finer * rows, finer * columns
     # The corners of a picture lie half a pixel out from the middles of its outermost pixels.

@@ -28,12 +28,12 @@ class UsbCamera:
 
 
 def list_cameras(root: Path = _ROOT) -> list[UsbCamera]:
-    """List all USB cameras; of a camera's several nodes the one with pictures (index 0)."""
+    """List all USB cameras, each by its node with pictures (index 0)."""
     found = []
     for node in sorted(root.glob("video*"), key=lambda n: (len(n.name), n.name)):
         if _read_text(node / "index") != "0":
             continue
-        device = (node / "device").resolve()  # of several folders above it the USB device's own
+        device = (node / "device").resolve()  # the USB device is one of its parent folders
         usb = next((p for p in (device, *device.parents) if (p / "idProduct").exists()), node)
         serial, product = _read_text(usb / "serial"), _read_text(usb / "product")
         found.append(UsbCamera(f"/dev/{node.name}", product or _read_text(node / "name"), serial))
@@ -41,7 +41,7 @@ def list_cameras(root: Path = _ROOT) -> list[UsbCamera]:
 
 
 def find_sensor_camera(model: SensorModel, serial: str = "", root: Path = _ROOT) -> UsbCamera:
-    """Return the camera of a fingertip sensor, of several the one with this serial number.
+    """Return the camera of a fingertip sensor, with this serial number if one is given.
 
     UserError if there is none, there are several, or this kind's USB name is not known.
     """

@@ -46,8 +46,7 @@ class VideoConfig:
     # s after which an identical picture, or part of one, counts as old; infinity for rendered
     # pictures, which lack the noise of real ones
     frozen_after: float = 0.5
-    # identical pictures in a row required besides, for a lock-step twin, whose time is not wall
-    # time
+    # and identical pictures in a row, for a lock-step twin, whose time is not wall time
     frozen_pictures: int = 0
     gel: bool = False  # a fingertip's: smooth but for its dots, so broken pictures show
     dots: float = 0.0  # diameter of the printed dots as a share of the picture's diagonal; 0: none
@@ -110,7 +109,7 @@ class VideoCamera:
         self._image: np.ndarray | None = None
         self._broken_blocks = BrokenBlocks(config.dots) if config.gel else None
         self._frozen_parts, self._decoder = FrozenParts(), JpegDecoder()
-        self._same, self._frozen = 0, False  # pictures in a row of which some part was as before
+        self._same, self._frozen = 0, False  # pictures in a row with an unchanged part
         self._lost = self._refused = ""
         self._closed = False
         self._latest = LatestValue(f"camera {config.source}", self._take)

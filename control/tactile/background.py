@@ -19,12 +19,12 @@ _BLUR_CELLS = 1.5
 # Cosines down and across the image that count as drift: a half wave of 60 px at 320 x 240, the
 # smooth pattern by which a Mini differs from one day to the next (Tactile-MNIST).
 _WAVES = 4, 5
-_RATE = 0.02  # share of a frame that enters: 2 s at 25 Hz, slower than any contact
+_RATE = 0.02  # weight of a new frame: a time constant of 2 s at 25 Hz, slower than contacts
 # Standard deviations between 150,000 real touches of Minis (Tactile-MNIST), counts.
 _OFFSET_SPREAD, _PATTERN_SPREAD = 2.4, 2.4
-_MOVED = 1.5  # counts of local change among the first frames that are no noise
+_MOVED = 1.5  # counts of local change among the first frames that noise does not reach
 _JITTER = 1.0  # px by which a camera shakes; dots that move farther together are a touch
-_ANOTHER_SENSOR = 5.0  # counts of local change to a reference; drift of the full spread gives 3
+_ANOTHER_SENSOR = 5.0  # counts of local change to a reference; the usual drift gives 3
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ THRESHOLD = 1.2  # counts; noise of 1 count has a strength of 0.3, at most 0.45
 _SPARE = 2.5
 _LEARNING_FRAMES = 10  # 0.4 s of a 25 Hz sensor
 _LEARNING_QUANTILE = 0.3
-_OVER_NOISE = 1.8  # times the usual strength of noise, where a contact ends at the latest
+_OVER_NOISE = 1.8  # factor on the usual noise, below which a contact ends in any case
 _LEARNING_THRESHOLD = 5.0  # counts; the strongest compression noise measured had a strength of 2.5
 # Strength of a change per its median over the picture, above which it is no noise: Gaussian noise
 # reaches 6, presses of balls on a real Mini 16 to 25.
@@ -27,8 +27,8 @@ class ContactDetector:
     Contact begins when `strength` (see `contact_strength`) exceeds the threshold, counts. It ends
     below half of it, so that it does not flicker, or below a tenth of the contact's peak, because
     the light drifts on during a long one. Without a threshold it is learned from the noise of the
-    first 10 frames, during which only a strong contact counts: 5 counts, and eight times the
-    median over the picture, for noise is everywhere.
+    first 10 frames, during which only a strong contact counts: 5 counts, and eight times the median
+    over the picture, because noise is everywhere.
     """
 
     def __init__(self, background: Background, threshold: float | int | None = None) -> None:

@@ -28,8 +28,8 @@ _INNER = 5  # conjugate gradient steps to a Gauss-Newton step
 _MODEL_ERROR = 0.5  # counts by which a perfect calibration still differs from the picture
 _OUTLIER = 4.0  # standard deviations beyond which a pixel counts less
 _DAMPING = 0.01  # of the usual curvature
-# The lowest tenth of the surface is believed to be gel at rest: to lie within _REST, once for each
-# patch of _PATCH pixels. It decides where the colours leave the depth open.
+# Prior where colours leave the depth open: the lowest tenth of the surface is gel at rest, within
+# _REST of zero, counted once per patch of _PATCH pixels.
 _FLAT = 4e-6  # m around its upper end
 _REST = 40e-6  # m
 _PATCH = 400
@@ -124,7 +124,7 @@ class _Level:
         gx, gy = np.empty_like(surface), np.empty_like(surface)
         depth_steps.slopes(surface, self._half, gx, gy)
         dark = shadows(p, surface, self._pitch)
-        # What shadows and depth leave for the slopes to explain.
+        # The change that remains for the slopes to explain.
         left = target - self._per_depth * np.minimum(surface, np.float32(p.max_depth))
         left -= self._gain * np.tensordot(p.shadow, dark, 1)
         model = self._gain, self._places, self._coefficients

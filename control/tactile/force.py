@@ -19,7 +19,7 @@ RIDGE_STRENGTH = 10.0
 """From 0.1 to 100 the error on real grasps of unseen objects stays below 2.2 N."""
 _WIDTH = 320  # px
 _PERCENTILES = (50, 75, 90, 97, 99.5)
-_COUNTS = (3, 6, 12, 24)  # of change, whose area is a statistic
+_COUNTS = (3, 6, 12, 24)  # counts of change; the areas above them are statistics
 _MIN_FRAMES = 50
 
 

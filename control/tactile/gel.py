@@ -13,14 +13,14 @@ from jaxtyping import Float32, UInt8
 from touchgoal.control.arrays import Map
 
 # Bulge and shadows are smooth: they are computed on cells of about this size, m. In metres, so that
-# a surface gives the same at every resolution.
+# the result does not depend on the resolution.
 CELL = 0.236e-3
-SHADOW_CELLS = 16  # how far a shadow reaches at most; on real presses 31 gains nothing
+SHADOW_CELLS = 16  # longest shadow, cells; on real presses 31 improve nothing
 
 # The gel touches the object where the overlap exceeds this share of its maximum nearby; around that
 # it has already come loose and bulges. Taxim's value; on real ball presses 0.3 to 0.4 fit best.
 CONTACT_SHARE = 0.4
-NEARBY_CELLS = 12  # 2.8 mm: a press twice as far away, or a tilted edge's other end, is another
+NEARBY_CELLS = 12  # 2.8 mm: farther maxima belong to another press, or a tilted edge's other end
 
 
 def pixels_per_cell(pitch: float) -> int:
@@ -71,14 +71,14 @@ def shadow_depth(
     longest = min(max(math.ceil(float(low.max()) / rise), 0), SHADOW_CELLS)
     shadows = np.empty((len(azimuths), h, w), np.float32)
     for shadow, azimuth in zip(shadows, azimuths, strict=True):
-        # Measured from a plane that climbs to the light, the running maximum is a plain one.
+        # With the light's slope subtracted, the shadow line is a running maximum.
         tilted = low - _plane(azimuth, rise, low.shape)
         depth = cv2.dilate(tilted, _ray_mask(azimuth, longest)) - tilted
         cv2.resize(cv2.blur(depth, (3, 3)), (w, h), dst=shadow, interpolation=cv2.INTER_LINEAR)
     return shadows
 
 
-@lru_cache(maxsize=256)  # a calibration asks for thousands
+@lru_cache(maxsize=256)  # a calibration calls it thousands of times
 def _plane(azimuth: float, rise: float, shape: tuple[int, int]) -> Map:
     """Return a plane that climbs by `rise` each cell in a direction, degrees."""
     y, x = (rise * np.arange(n) for n in shape)

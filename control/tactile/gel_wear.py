@@ -1,7 +1,7 @@
 """Wear of a gel, seen on its untouched picture: torn, scratched or dirty.
 
-The operator of MMWand looks at the gel after each press; here the picture is compared with the
-first one of the same gel, light taken out.
+The operator of MMWand looks at the gel after each press; here the picture, corrected for light, is
+compared with the gel's first one.
 """
 
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.markers import find_markers, without_markers
 from touchgoal.control.tactile.sensor_models import SensorModel
 
-# Strength of a change, counts, and times the usual one of the picture. Between untouched pictures of
+# Strength of a change: counts, and multiple of the picture's median. Between untouched pictures of
 # one gel the strongest is 1.0 and 3.9 times the usual in simulation (single frames, light changed by
 # 5 %). Of 408 pairs of real videos in a row (PhysiCLeAR, medians of 5 compressed frames) 22 exceed both:
 # dust and scratches that came between them, and the corners of the case.
 _LEAST, _TIMES_USUAL = 2.5, 6.0
 _BORDER = 16  # 1/n of each side is left out: there the case's edge shines
-_SPOT = 0.4  # of the strongest change, down to which its surroundings belong to it
+_SPOT = 0.4  # share of the strongest change above which adjacent pixels belong to the spot
 _SLENDER = 2.2  # length over mean width of a scratch; a round spot has 1.3
 _HOLE, _HOLE_WIDTH = 40.0, 1e-3  # counts, m: a dust grain is as strong, but small
 

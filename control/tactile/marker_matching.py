@@ -19,16 +19,18 @@ Points = Float32[np.ndarray, "dots 2"]
 
 # Lengths are in spacings of the grid.
 _REACH = 0.5  # farthest spot from a dot's expected place
-_CLEAR = 0.08  # distance and motion cost of a start after which no other is tried
-_FARTHEST = 1  # jump along x or y that is searched
-_BINS = 8  # of the search, a spacing
-_JUMPS = 4  # likeliest ones that are tried
+_CLEAR = 0.08  # cost (mean distance and motion) below which no other start is tried
+_FARTHEST = 1  # longest jump along x or y that is searched
+_BINS = 8  # bins of the search per spacing
+_JUMPS = 4  # likeliest jumps that are tried
 _ROUNDS = 4  # of matching and fitting, at most
 _STRAY = 0.1  # distance from the map at which a dot counts half
 _FEWEST = 0.3  # share of the dots that a map needs
-_STIFF = 1e-2  # dots by which a map is held to no motion: a single row cannot tell its shear
-_RIM = 0.1  # of the frame, where a dot is no longer seen whole
-_MOTION_COST = 0.1  # distance a motion: a column that appears at the rim is no jump by a spacing
+# weight, in dots, of zero shear and scale: a single row of dots does not determine them
+_STIFF = 1e-2
+_RIM = 0.1  # width of the frame's rim, where dots are not seen whole
+# cost of motion: a column that appears at the rim shall not look like a jump by a spacing
+_MOTION_COST = 0.1
 
 
 class _Match(NamedTuple):
@@ -65,7 +67,7 @@ def match(
         if least < _CLEAR * spacing:
             break
     assert best is not None
-    # What no map explains is smooth, too: neighbours say where a dot is.
+    # The rest that the map leaves is smooth, too: predict it from neighbouring dots.
     off = (spots[best.spot] - best.expected).reshape(shape)
     bent = spread(off, best.found.reshape(shape[:2])).reshape(-1, 2)
     final = _nearest(best.expected + bent, spots, _REACH * spacing)
@@ -132,7 +134,7 @@ def _affine(
 def _left_over(
     match: _Match, n_spots: int, spacing: float, size: Float32[np.ndarray, "2"]
 ) -> float:
-    """Return the mean distance (px) of dots from spots; one without the other is half a spacing."""
+    """Return the mean distance (px) of dots from spots; unmatched ones count half a spacing."""
     rim = _RIM * spacing
     inside = ((match.expected > rim) & (match.expected < size - 1 - rim)).all(1)
     single = (inside & ~match.found).sum() + n_spots - match.found.sum()
@@ -141,7 +143,7 @@ def _left_over(
 
 
 def _likely_jumps(before: Points, spots: Spots, spacing: float) -> Float32[np.ndarray, "jumps 2"]:
-    """Return the motions (px) that carry most dots onto spots, all by the same."""
+    """Return the common motions (px) that carry most dots onto spots."""
     step, half = spacing / _BINS, _BINS * _FARTHEST
     apart = np.rint((spots[None] - before[:, None]) / step).astype(int).reshape(-1, 2) + half
     n = 2 * half + 1

@@ -16,7 +16,7 @@ _FAINTEST = 0.5  # of the usual darkness: a fainter spot is no dot
 _LEAST_FOUND = 0.7  # of the grid, or it is no marker gel
 _NOISE = 0.02  # darkness of a spot that may be noise
 _RIM = 2.0  # px around a dot's nominal radius that may still be dark
-_LARGER = 1.1  # times a dot's nominal radius: how large those of another gel may be
+_LARGER = 1.1  # factor on the nominal radius: largest dots of another gel
 
 Grey = Float32[np.ndarray, "h w 1"]
 
@@ -174,7 +174,7 @@ def _refined(grey: Grey, spots: Spots, radius: float) -> Spots:
 
 
 def _ordered(spots: Spots, pitch: float) -> Int[np.ndarray, "n 2"]:
-    """Return (column, row) of each spot from the middlemost; far outside if cut off from it."""
+    """Return (column, row) of each spot from the middlemost; far outside if not connected to it."""
     cells = np.full((len(spots), 2), -(10**6))
     if not len(spots):
         return cells
@@ -182,7 +182,8 @@ def _ordered(spots: Spots, pitch: float) -> Int[np.ndarray, "n 2"]:
     distance = np.linalg.norm(apart, axis=-1)
     close = np.abs(distance - pitch) < 0.25 * pitch
     along = np.arctan2(apart[close][:, 1], apart[close][:, 0])
-    # Lattice steps point four ways, a right angle apart: four times their angle is one direction.
+    # Lattice steps point four ways, a right angle apart: four times their angle is the same for
+    # all.
     angle = np.angle(np.exp(4j * along).sum()) / 4
     step = float(np.median(distance[close])) if close.any() else pitch
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])

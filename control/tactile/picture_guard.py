@@ -1,10 +1,10 @@
 """Check that fingertip pictures are the sensor's: whole, in RGB order, the right way round.
 
-The untouched picture is compared with the sensor file's under other orders of the channels,
-mirrors, scales and shifts, but for a factor on each channel; what fits clearly better is the fault.
-A step across half a row is the seam of a torn picture. Presses decide what is left open: a Mini's
-picture is nearly the same mirrored left to right, but the sensor file then explains no press.
-Printed dots and dust do not count.
+The untouched picture is compared with the sensor file's under other channel orders, mirrors, scales
+and shifts, ignoring each channel's gain. A hypothesis that fits clearly better is the fault. A step
+across half a row is the seam of a torn picture. Presses decide what is left open: a Mini's picture
+is nearly the same mirrored left to right, but the sensor file then explains no press. Printed dots
+and dust do not count.
 """
 
 from collections.abc import Sequence
@@ -28,18 +28,18 @@ from touchgoal.runtime.errors import UserError
 _SEAM, _STEP = 3.5, 6.0  # times the usual step from row to row; counts, the channels' sum
 _EDGE = 10  # share of a picture (1/n) at either end where a seam may be the sensor's case
 _SEAM_PARTS = 32  # along a row, half of which must show the step
-_CLEARLY = 0.85  # of the difference that another order or mirror may leave
-_CLEARLY_MOVED = 0.75  # of the difference that another scale or shift may leave
-_SAME_UNIT = 0.035  # difference below which the file is of this very unit
-_OPEN = 1.5  # times the difference up to which presses have to decide
-_EXPLAINS = 0.8  # of the unexplained change that another order or mirror may leave
+_CLEARLY = 0.85  # share of the difference that a better order or mirror may leave
+_CLEARLY_MOVED = 0.75  # share of the difference that a better scale or shift may leave
+_SAME_UNIT = 0.035  # difference below which the file was made from this very unit
+_OPEN = 1.5  # factor on the difference within which presses have to decide
+_EXPLAINS = 0.8  # share of the unexplained change that a better order or mirror may leave
 UNEXPLAINED = 0.65
 """Share of a press's change that a sensor file may leave unexplained."""
 _MAX_PRESSES, _CELL = 6, 8  # px
 _STRONGEST = 0.1  # share of the picture over which the explanation is judged
 _COARSE = 4  # px of the sensor's picture to a cell of the comparison
 _DARK = 8.0  # counts added before the logarithm: noise in the dark is no difference
-_MOST = 0.5  # logarithm of light: a spot counts no more
+_MOST = 0.5  # largest difference of log light that a cell counts with
 _COLOURS = "red", "green", "blue"
 
 Cells = Float32[np.ndarray, "rows columns 3"]
@@ -217,14 +217,14 @@ def _coarse(picture: Picture, sensor: SensorModel) -> Cells:
 
 
 def _difference(one: Cells, other: Cells) -> float:
-    """Return the mean difference but for a factor on each channel; no spot counts much."""
+    """Return the mean difference without each channel's gain; single spots count little."""
     change = one - other
     change -= np.median(change.reshape(-1, 3), 0)
     return float(np.minimum(np.abs(change), _MOST).mean())
 
 
 def _moved(image: Cells, x: float, y: float, right: float, down: float) -> Cells:
-    """Scale an image about its middle, then shift it; the border goes on."""
+    """Scale an image about its middle, then shift it; border pixels are replicated."""
     height, width, _ = image.shape
     affine = np.array(
         [[x, 0, (1 - x) * width / 2 + right], [0, y, (1 - y) * height / 2 + down]], np.float32

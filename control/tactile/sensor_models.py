@@ -116,12 +116,12 @@ DIGIT = SensorModel(
 )
 
 # A finger whose camera sees the gel at an angle (Wang et al. 2021, arXiv 2106.08851); its picture
-# is that between the gel's corners, which differ from unit to unit. Scale: a round number; taken
-# for 33 x 24 mm, EstimateModulus' pictures show the dimples of golf balls 3.9 mm apart, where 400
-# to 300 of them spread evenly over a ball lie 4.1 to 4.7 mm apart: it may be a tenth larger. 30
-# pictures a second there, too. Gel: as large as the picture; its case is drawn around it. Thickness
-# and moduli are not published in what was at hand: the Mini's. Sensor file: a drawing of its lamps
-# (`led_ring.py`), fitted to nothing, for no pictures of rigid balls may ship.
+# is that between the gel's corners, which differ from unit to unit. Scale: a round number that may
+# be a tenth too small. With it, golf ball dimples in EstimateModulus' pictures are 3.9 mm apart;
+# 300 to 400 dimples on a ball would be 4.1 to 4.7 mm apart. Frame rate: that of these pictures.
+# Gel: as large as the picture; case: a margin around it. Thickness and moduli were not found: the
+# Mini's. Sensor file: computed from lamp positions (`led_ring.py`), because no pictures of rigid
+# balls may be shipped.
 GELSIGHT_WEDGE = replace(
     GELSIGHT_MINI,
     name="gelsight_wedge",
