@@ -1,9 +1,11 @@
-"""Fit the normalizer that makes distances comparable, on successful episodes of your own.
+"""Fit what makes distances comparable, on successful episodes of your own.
 
 Distances to a goal differ in size between cameras, encoders and scenes. This command finds where
-successful episodes usually start and end, for each modality, and writes normalizer.json. With
-`reward-curves --normalizer`, a cost of 1 is then the usual start and 0 the usual end. Any camera
-works; plain videos work for images.
+successful episodes usually start and end, for each modality, and how far their ends lie apart, for
+each part of the cost. It writes normalizer.json, and goal.npz: the successful ends as a goal. With
+--value it also learns how far along its way a picture is (value.json, value.safetensors), which
+`reward-curves` uses if it lies beside the normalizer. Any camera works; plain videos work for
+images.
 """
 
 from pathlib import Path
@@ -11,7 +13,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from touchgoal.runtime.option_types import checked_dataclass
+from touchgoal.runtime.option_types import Seed, checked_dataclass
 
 
 @checked_dataclass
@@ -22,8 +24,11 @@ class Config:
     """A set of episodes; or at least two video files or folders of images, each of one success."""
     modalities: tuple[Literal["image", "tactile", "text"], ...] = ()
     """Modalities to fit. Default: all that the episodes have."""
+    value: bool = False
+    """Also fit a value of the task, from 4 successes on, in a minute or two. It holds for this task,
+    these cameras and towers, and does not read the goal."""
     camera: str = "front"
-    """Camera of the episodes: front or wrist."""
+    """Camera of the plain distance of images: front or wrist."""
     encoder: str | None = None
     """Touch encoder: a name (touchgoal list encoders), a folder, or a published Sparsh one. Default:
     the one that ships for the episodes' sensor. Sentences need one that is aligned with texts."""
@@ -32,19 +37,24 @@ class Config:
     only images are measured with them."""
     assume_success: bool = False
     """Take episodes without a recorded outcome as successes."""
+    seed: Seed = 0
+    """Random seed of the value."""
     device: str = "cpu"
     """Torch device of the encoders: cpu, cuda or cuda:1."""
     out: Path | None = None
-    """Folder of the run, for normalizer.json."""
+    """Folder of the run."""
 
 
 def main(config: Config) -> None:
     """Check, embed, fit, and write normalizer.json."""
     from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
     from touchgoal.rewards.distance.normalizer import NORMALIZER
+    from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
+    from touchgoal.rewards.fit_value import fit_value
     from touchgoal.rewards.reward_model import load_embedder
     from touchgoal.rewards.sources.open_source import open_successes
     from touchgoal.runtime.progress import track
+    from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run
 
     with_touch = config.towers is None or config.encoder is not None
@@ -62,7 +72,11 @@ def main(config: Config) -> None:
         m for m in embedded[0].modalities if m != "text" or has_words
     )
     normalizer = fit_normalizer(embedded, modalities, inputs.scene)
+    value = fit_value(embedded, inputs.fitted_task, config.seed) if config.value else None
     normalizer.save(out / NORMALIZER)
+    SuccessfulEnds.of(embedded).save(out / GOAL_FILE)
+    if value is not None:
+        value.save(out, provenance())
     print(f"{'fitted':<24}{'usual start':>12}{'usual end':>12}{'separated':>12}")
     for name, start in normalizer.start.items():
         end, share = normalizer.goal[name], normalizer.separated[name]
@@ -71,4 +85,7 @@ def main(config: Config) -> None:
     print("  usual end      the same at its end")
     print("  separated      share of (episode, goal) pairs whose end is nearer than its start")
     print("  same episode   the goal is the episode's own last frame, else another's or a sentence")
-    print(f"next: touchgoal reward-curves {config.sources[0]} --normalizer {out / NORMALIZER}")
+    units = ", ".join(f"{name} {unit:.3g}" for name, unit in normalizer.unit.items())
+    print(f"spread of successful ends by part: {units or 'none, for no two hold the same object'}")
+    goal = f"--goal goal:{out / GOAL_FILE} --normalizer {out / NORMALIZER}"
+    print(f"next: touchgoal reward-curves {config.sources[0]} {goal}")

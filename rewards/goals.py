@@ -24,7 +24,7 @@ from touchgoal.runtime.picture_file import read_picture
 Modality = Literal["image", "tactile", "text"]
 MODALITIES: tuple[Modality, ...] = ("image", "tactile", "text")
 
-FORMS = "last, frame:K, image:PATH, episode:ROOT#K or text:SENTENCE"
+FORMS = "last, frame:K, image:PATH, episode:ROOT#K, bank:SET, goal:FILE or text:SENTENCE"
 _SMALLEST = 16  # px, the smallest camera image that the environments take
 
 
@@ -132,18 +132,56 @@ class EpisodeEnd:
 
 
 @dataclass(frozen=True)
+class Bank:
+    """The ends of all successful episodes of the set in `root`; the nearest counts, softly.
+
+    Where objects are recorded, those with the object of the trajectory.
+    """
+
+    root: Path
+    modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
+
+    def __str__(self) -> str:
+        return f"bank:{self.root}"
+
+    def ends(self) -> list[EpisodeEnd]:
+        """Return the ends; UserError: no such set, or no episode marked as a success."""
+        episodes = EpisodeSet(self.root)
+        found = [i for i in range(len(episodes)) if episodes.meta(i).get("success") is True]
+        if not found:
+            raise UserError(f"goal '{self}': no episode of {self.root} is marked as a success")
+        return [EpisodeEnd(self.root, i) for i in found]
+
+
+@dataclass(frozen=True)
+class GoalFile:
+    """Embedded ends of successes in a file, which fit-normalizer wrote: used as a `Bank`."""
+
+    path: Path
+    modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
+
+    def __str__(self) -> str:
+        return f"goal:{self.path}"
+
+
+@dataclass(frozen=True)
 class Sentence:
-    """How the object feels, in words. Sentence encoders hardly see a "not": say what is there."""
+    """How the object feels, in words. Sentence encoders hardly see a "not": say what is there.
+
+    With a baseline sentence, such as "an object", only the direction from it to the sentence counts
+    (VLM-RM, arXiv 2310.12921): see `distance.embedding_distance.text_distances`.
+    """
 
     text: str
+    baseline: str = ""
     modalities: ClassVar[tuple[Modality, ...]] = ("text",)
 
     def __str__(self) -> str:
-        return f"text:{self.text}"
+        return f"text:{self.text}" + (f"|{self.baseline}" if self.baseline else "")
 
 
-PictureGoal = OwnFrame | GoalPicture | EpisodeEnd | Sentence
-TouchGoal = OwnFrame | TouchArrays | EpisodeEnd
+PictureGoal = OwnFrame | GoalPicture | EpisodeEnd | Bank | GoalFile | Sentence
+TouchGoal = OwnFrame | TouchArrays | EpisodeEnd | Bank | GoalFile
 GoalSpec = PictureGoal | TouchGoal
 
 
@@ -179,8 +217,13 @@ def parse_goal(text: str) -> GoalSpec:
         return GoalPicture(Path(value))
     if kind == "episode" and episode:
         return EpisodeEnd(Path(episode[1]), int(episode[2]))
-    if kind == "text" and value:
-        return Sentence(value)
+    if kind == "bank" and value:
+        return Bank(Path(value))
+    if kind == "goal" and value:
+        return GoalFile(Path(value))
+    if kind == "text" and value.partition("|")[0].strip():
+        sentence, _, baseline = value.partition("|")
+        return Sentence(sentence.strip(), baseline.strip())
     raise UserError(f"goal '{text}' is not understood; write {FORMS}")
 
 
@@ -230,6 +273,11 @@ def check_goal(goal: Goal, inputs: Inputs) -> None:
         goal.image.read([inputs.camera or FRONT])
     if isinstance(goal.tactile, EpisodeEnd):
         goal.tactile.read(inputs.sides)
+    for spec in (goal.image, goal.tactile):
+        if isinstance(spec, Bank):
+            spec.ends()
+        if isinstance(spec, GoalFile) and not spec.path.is_file():
+            raise UserError(f"goal '{spec}' does not exist: write one with fit-normalizer")
 
 
 def frame_index(spec: OwnFrame, length: int, source: str) -> int:

@@ -1,6 +1,7 @@
 """Named parts of a cost: distances, units, gate, smoothing, fusion, value; in one go and streamed."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from touchgoal.rewards.distance.parts import (
     contact_distances,
     gate,
     object_distances,
+    part_distances,
     smooth,
     soft_minimum,
 )
@@ -24,6 +26,7 @@ from touchgoal.rewards.features.embedded import (
     EmbeddedEpisode,
     goal_at_every_frame,
 )
+from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.fit_value import fit_value
 from touchgoal.rewards.value import Value
 from touchgoal.runtime.errors import UserError
@@ -194,3 +197,24 @@ def test_a_press_is_read_where_and_how_hard_it_is() -> None:
     assert readings.force[0, :6].tolist() == [0] * 6 and readings.force[0, -1] > 0
     blind = ContactReader(None, frames[:5]).read(frames)
     assert blind.touching.tolist() == readings.touching.tolist() and blind.force is None
+
+
+def test_ends_are_a_goal_that_is_saved_and_chosen_by_object(
+    successes: list[EmbeddedEpisode], tmp_path: Path
+) -> None:
+    others = [replace(e, object="pear") for e in successes[:2]]
+    SuccessfulEnds.of([*successes, *others]).save(tmp_path / "goal.npz")
+    ends = SuccessfulEnds.load(tmp_path / "goal.npz")
+    assert len(ends.frames) == 8 and len(ends.of_object("pear", "goal")) == 2
+    assert len(ends.of_object("", "goal")) == 8
+    with pytest.raises(UserError, match="no end with plum, only with apple, pear"):
+        ends.of_object("plum", "goal")
+    mine = part_distances(embedded(9), goal_at_every_frame(ends.of_object("apple", "goal")))
+    last = [
+        part_distances(embedded(9), goal_at_every_frame(e.take(slice(-1, None)))) for e in successes
+    ]
+    for name, d in mine.items():
+        assert d == pytest.approx(np.concatenate([one[name] for one in last], 1), abs=1e-6), name
+    (tmp_path / "goal.npz").write_text("no file")
+    with pytest.raises(UserError, match="is no goal file"):
+        SuccessfulEnds.load(tmp_path / "goal.npz")

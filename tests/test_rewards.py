@@ -105,7 +105,7 @@ def test_goal_is_read_and_written_back(text: str, goal: object) -> None:
     "text", ["", "lst", "frame:", "frame:-1", "frame:x", "image:", "episode:data", "text:  "]
 )
 def test_unknown_goal_lists_the_forms(text: str) -> None:
-    with pytest.raises(UserError, match="last, frame:K, image:PATH, episode:ROOT#K or text:SENT"):
+    with pytest.raises(UserError, match="last, frame:K, image:PATH, episode:ROOT#K, bank:SET"):
         parse_goal(text)
 
 

@@ -21,6 +21,8 @@ from touchgoal.rewards.distance.parts import (
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.value import Value
 
+_ALPHA = 0.5  # share of the way to the line through baseline and sentence
+
 
 def compute_distances(
     episode: EmbeddedEpisode, goal: EmbeddedGoal
@@ -32,7 +34,7 @@ def compute_distances(
     if goal.touch is not None:
         raw["tactile"] = soft_minimum(touch_distances(episode.touches(), goal.touch))
     if goal.text is not None:
-        raw["text"] = soft_minimum(text_distances(episode.touches(), goal.text))
+        raw["text"] = soft_minimum(text_distances(episode.touches(), goal.text, goal.text_baseline))
     return raw
 
 
@@ -81,7 +83,23 @@ def touch_distances(
 
 
 def text_distances(
-    touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "g k"]
+    touch: Float32[np.ndarray, "sides n k"],
+    goals: Float32[np.ndarray, "g k"],
+    baseline: Float32[np.ndarray, "b k"] | None = None,
 ) -> Float[np.ndarray, "n g"]:
-    """Return the distance of each touch to each sentence, mean over the fingertips."""
-    return 1 - np.mean(touch, axis=0, dtype=np.float64) @ goals.astype(np.float64).T
+    """Return the distance of each touch to each sentence, mean over the fingertips.
+
+    With a baseline sentence, a touch is first moved half of the way to the line through baseline and
+    sentence, and the distance is half the squared one (VLM-RM with alpha = 0.5): what does not
+    distinguish the two counts less.
+    """
+    if baseline is None or not len(baseline):
+        return 1 - np.mean(touch, axis=0, dtype=np.float64) @ goals.astype(np.float64).T
+    distances = []
+    for goal in goals.astype(np.float64):
+        line = goal - baseline[0]
+        line /= max(float(np.linalg.norm(line)), 1e-9)
+        along = ((touch - baseline[0]) @ line)[..., None] * line + baseline[0]
+        moved = _ALPHA * along + (1 - _ALPHA) * touch
+        distances.append(((moved - goal) ** 2).sum(-1).mean(0) / 2)
+    return np.stack(distances, axis=1)

@@ -15,6 +15,7 @@ from touchgoal.rewards.features.embedded import EmbeddedEpisode, goal_at_every_f
 from touchgoal.rewards.goals import Modality
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.provenance import command_line, portable
 
 END_FRAMES = 5
 """Frames before the last one that stand for the end of a training episode."""
@@ -54,7 +55,10 @@ def fit_normalizer(
             separated[name] = _check_separation(name, starts, ends)
             start[name], goal[name] = float(np.median(starts)), float(np.median(ends))
     units, made_with = fit_units(episodes), episodes[0].made_with
-    return DistanceNormalizer(start, goal, units, separated, made_with, scene, len(episodes))
+    command = portable(command_line())
+    return DistanceNormalizer(
+        start, goal, units, separated, made_with, scene, len(episodes), command
+    )
 
 
 def fit_units(episodes: Sequence[EmbeddedEpisode]) -> dict[str, float]:

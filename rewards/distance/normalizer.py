@@ -32,6 +32,17 @@ class EmbeddingSource:
     encoder: str = ""  # hash of the touch encoder's weights and preprocessor; "" without touch
     sensor: str = ""  # name of the fingertip sensor; "" without touch
 
+    def mismatch(self, other: "EmbeddingSource") -> str | None:
+        """Return why embeddings of another source cannot be compared with these; None if they can.
+
+        A plain video counts as taken by the camera here; what one of them lacks is not compared.
+        """
+        for what in ("towers", "camera", "sensor", "encoder"):
+            mine, theirs = getattr(self, what), getattr(other, what)
+            if mine and theirs and mine != theirs:
+                return f"its {what} is {mine}, not {theirs}"
+        return None
+
 
 def scene_of(features: Iterable[str]) -> str:
     """Return the simulated scene that episodes with these keys come from, or `REAL_SCENE`.
@@ -70,6 +81,7 @@ class DistanceNormalizer:
     source: EmbeddingSource  # encoders, camera and sensor of the embeddings
     scene: str  # see `scene_of`
     episodes: int  # number of training episodes
+    command: str = ""  # that fitted it
 
     def mismatch(
         self, source: EmbeddingSource, modalities: Iterable[str], same_episode: frozenset[str]

@@ -109,6 +109,7 @@ class EmbeddedGoal:
     image: Float32[np.ndarray, "g d"] | None = None
     touch: Float32[np.ndarray, "sides g k"] | None = None
     text: Float32[np.ndarray, "g k"] | None = None
+    text_baseline: Float32[np.ndarray, "b k"] | None = None  # of the sentence against it, if any
     cameras: Mapping[str, CameraFeatures] = field(default_factory=dict)
     readings: ContactReadings | None = None
 

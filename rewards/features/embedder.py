@@ -22,9 +22,12 @@ from touchgoal.rewards.curves import ContactSearch
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
 from touchgoal.rewards.features.embedded import CameraFeatures, EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.features.feature_stream import FeatureStream, Frames
+from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.goals import (
+    Bank,
     EpisodeEnd,
     Goal,
+    GoalFile,
     GoalPicture,
     GoalSpec,
     OwnFrame,
@@ -68,6 +71,7 @@ class EpisodeEmbedder:
         self.knows_words = self._aligned is not None  # touch can be compared with sentences
         self.camera = camera
         self.with_parts = with_parts
+        self._ends: dict[Bank | GoalFile, SuccessfulEnds] = {}
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
         self._pictures_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
         self.made_with = self._pictures_with  # of episodes with touch, if there is an encoder
@@ -160,7 +164,9 @@ class EpisodeEmbedder:
         if goal.tactile is not None:
             embedded = replace(embedded, **self._goal_touches(goal.tactile, own))
         if goal.text is not None:
-            embedded = replace(embedded, text=self.embed_sentences([goal.text.text]))
+            sentences = [s for s in (goal.text.text, goal.text.baseline) if s]
+            text = self.embed_sentences(sentences)
+            embedded = replace(embedded, text=text[:1], text_baseline=text[1:])
         return embedded
 
     def embed_camera(self, frames: UInt8[np.ndarray, "n h w 3"]) -> CameraFeatures:
@@ -202,6 +208,9 @@ class EpisodeEmbedder:
         if isinstance(spec, GoalPicture):
             cameras = {main: self.embed_camera(spec.read())}
             return {"image": cameras[main].pooled, "cameras": cameras}
+        if isinstance(spec, Bank | GoalFile):
+            end = self._successful_ends(spec, own).of_object(own.object, str(spec))
+            return {"image": end.image, "cameras": end.cameras}
         if isinstance(spec, EpisodeEnd):
             frames = spec.read(tuple(own.cameras) or (main,)).frames
             cameras = {k: self.embed_camera(v[-1:]) for k, v in frames.items() if is_camera(k)}
@@ -213,6 +222,8 @@ class EpisodeEmbedder:
         """Return the fields of an `EmbeddedGoal` that the goal of touch sets."""
         if isinstance(spec, OwnFrame):
             end = own.take(_one(frame_index(spec, len(own), own.source)))
+        elif isinstance(spec, Bank | GoalFile):
+            end = self._successful_ends(spec, own).of_object(own.object, str(spec))
         elif isinstance(spec, EpisodeEnd):
             read = spec.read(own.sides)
             end = self.embed_episode(replace(read, meta={}), own.fps, str(spec))
@@ -224,6 +235,25 @@ class EpisodeEmbedder:
             }
             end = self.stream(frames, own.fps, str(spec)).embed(frames).take(_one(START_FRAMES))
         return {"touch": end.touch, "readings": end.readings}
+
+    def _successful_ends(self, spec: Bank | GoalFile, own: EmbeddedEpisode) -> SuccessfulEnds:
+        """Return the ends of a bank, embedded once; UserError if they were embedded otherwise."""
+        if spec not in self._ends:
+            if isinstance(spec, GoalFile):
+                ends = SuccessfulEnds.load(spec.path)
+            else:
+                wanted = (*own.cameras, *((self.camera,) if self.camera else ()), *own.sides)
+                embedded = [self._embed_end(end, wanted, own.fps) for end in spec.ends()]
+                ends = SuccessfulEnds.of(embedded)
+            self._ends[spec] = ends
+        ends = self._ends[spec]
+        if (reason := ends.frames.made_with.mismatch(own.made_with)) is not None:
+            raise UserError(f"goal '{spec}' does not fit {own.source}: {reason}")
+        return ends
+
+    def _embed_end(self, end: EpisodeEnd, keys: Sequence[str], fps: float) -> EmbeddedEpisode:
+        """Return the first frames and the end of an episode, embedded."""
+        return self.embed_episode(end.read(tuple(dict.fromkeys(keys))), fps, str(end))
 
     def _embed_descriptions(
         self, episode: Episode, source: str
