@@ -2,6 +2,7 @@
 
 import io
 import re
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -68,33 +69,57 @@ def _encode(
 
 
 def decode_video(
-    video: bytes, fps: float | int, frames: Sequence[int]
+    video: bytes | Path, fps: float | int, frames: Sequence[int]
 ) -> UInt8[np.ndarray, "n h w 3"]:
-    """Decode the given frames of a video made by `encode_video`, in the given order.
+    """Decode the given frames of a video, in the given order; frame i is shown at i / fps seconds.
 
-    Only these frames and the key frames before them are decoded.
+    Only these frames and those since the key frame before them are decoded.
 
     UserError: the video has no such frame.
     """
-    wanted = sorted(set(frames))
-    with av.open(io.BytesIO(video), "r") as container:
+    wanted, interval = sorted(set(frames)), KEY_FRAME_INTERVAL
+    with av.open(io.BytesIO(video) if isinstance(video, bytes) else str(video), "r") as container:
         stream = container.streams.video[0]
         pictures = np.empty((len(wanted), stream.height, stream.width, 3), np.uint8)
         stream.codec_context.thread_count = 1  # readers are themselves many
         convert = VideoReformatter()
         decoder, position = container.decode(stream), -1
         for row, target in enumerate(wanted):
-            if target > position + KEY_FRAME_INTERVAL:
+            if sought := target > position + interval:
                 container.seek(round(target / fps / (stream.time_base or 1)), stream=stream)
                 decoder = container.decode(stream)
             while position != target:
                 frame = next(decoder, None)
                 position = target + 1 if frame is None else round((frame.time or 0.0) * fps)
+                if sought:  # other encoders set key frames further apart
+                    interval, sought = max(interval, target - position), False
                 if frame is None or position > target:
                     raise UserError(f"the video has no frame {target}")
                 if position == target:
                     pictures[row] = convert.reformat(frame, format="rgb24").to_ndarray()
     return pictures[np.searchsorted(wanted, np.asarray(frames, np.int64))]
+
+
+def video_length(path: Path) -> tuple[int, float]:
+    """Return how many frames a video holds, as it states, and its rate, frames per second."""
+    with av.open(str(path), "r") as container:
+        stream = container.streams.video[0]
+        return stream.frames, float(stream.average_rate or 0)
+
+
+def video_checksum(path: Path, fps: float | int, first: int, length: int) -> int:
+    """Return the CRC-32 of `length` encoded frames of a video from frame `first` on, not decoded."""
+    checksum = 0
+    with av.open(str(path), "r") as container:
+        stream = container.streams.video[0]
+        scale = float(stream.time_base or 1) * fps
+        container.seek(round(first / scale), stream=stream)
+        for packet in container.demux(stream):
+            if packet.pts is not None and 0 <= round(packet.pts * scale) - first < length:
+                checksum = zlib.crc32(bytes(packet), checksum)
+            if packet.dts is not None and round(packet.dts * scale) >= first + length:
+                break
+    return checksum
 
 
 def write_video(path: Path, frames: UInt8[np.ndarray, "n h w 3"], fps: float | int) -> None:

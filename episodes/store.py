@@ -1,6 +1,8 @@
 """Sets of episodes on disk: LeRobotDataset v3, written and read without lerobot.
 
-Every episode has its own data file and its own videos, numbered by the same number; an append
+Sets that lerobot wrote, edited or continued are read, too; touchgoal changes only its own.
+
+In these every episode has its own data file and its own videos, numbered by the same number; an append
 writes them first and then everything under meta/, each file in one atomic step, info.json last.
 A set holds what its info.json lists; a process killed at any moment leaves at most the files of the
 episode in progress, which `repair` adds (if complete) or moves aside.
@@ -9,23 +11,28 @@ episode in progress, which `repair` adds (if complete) or moves aside.
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import av.error
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
-from touchgoal.episodes.format import set_files
+from touchgoal.episodes.format import episode_table, set_files
 from touchgoal.episodes.format.encoding import EncodedEpisode, data_file, encode, read_columns
+from touchgoal.episodes.format.episode_table import EpisodePlace
+from touchgoal.episodes.format.foreign import foreign_file, refusal
 from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.episodes.format.repair import unlisted_files
-from touchgoal.episodes.format.set_files import Row
-from touchgoal.episodes.media import decode_video
-from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue, is_camera, is_image
+from touchgoal.episodes.keys import guess_keys, note_guess, readable_features, stored_names
+from touchgoal.episodes.media import decode_video, video_checksum, video_length
+from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.folder_lock import FolderLock
@@ -46,8 +53,8 @@ class EpisodeWriter:
             fps: Frames per second of the episodes to come.
 
         Raises:
-            UserError: An existing set has another rate, was interrupted, is damaged or was continued
-                by lerobot; another process records into it; the folder cannot be made.
+            UserError: An existing set has another rate, was interrupted, is damaged or was edited by
+                lerobot; another process records into it; the folder cannot be made.
         """
         self._root = Path(root)
         self._fps = fps
@@ -62,8 +69,11 @@ class EpisodeWriter:
         """Return the checked metadata of the set; None before the first episode."""
         found = None
         if (self._root / set_files.INFO).exists():
+            features = set_files.load_info(self._root)["features"]
+            table = episode_table.load_table(self._root, leave_out="stats/")
+            if path := foreign_file(self._root, features, table):
+                raise refusal(self._root, path)
             found = SetMetadata.load(self._root)
-            set_files.refuse_other_writers(self._root, found.features, found.episodes)
             if found.fps != self._fps:
                 raise UserError(
                     f"{self._root} runs at {found.fps} frames per second, not {self._fps}: "
@@ -117,88 +127,127 @@ class EpisodeWriter:
 
 
 class EpisodeSet:
-    """A set of episodes for reading, as it was when opened."""
+    """A set of episodes for reading, as it was when opened: touchgoal's own, or any LeRobot v3 set."""
 
-    def __init__(self, root: str | os.PathLike[str], complete: bool = True) -> None:
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        complete: bool = True,
+        keys: Mapping[str, str] | None = None,
+    ) -> None:
         """Open a set.
 
         Args:
             root: Folder of the set, or of the run that recorded it into its `episodes/`.
             complete: Whether every file must be there; else `read` finds what is missing.
+            keys: New keys of features by their stored names. In a set that touchgoal did not write,
+                tactile images under other names are recognised without (noted on stderr).
 
         Raises:
-            UserError: Not a set, an unknown version, or written by lerobot in part or whole; a
-                metadata file is corrupt; a file is missing.
+            UserError: Not a set, or of an unknown version; a metadata file is corrupt; a file is
+                missing; a key that cannot be.
         """
         self.root = set_files.set_folder(Path(root))
         info = set_files.load_info(self.root)
         self.fps: int = info["fps"]
+        table = episode_table.load_table(self.root, leave_out="stats/")
+        self.foreign = foreign_file(self.root, info["features"], table) is not None
+        """Whether lerobot wrote, edited or continued the set; touchgoal does not change such a one."""
+        features = readable_features(info["features"])
+        given = dict(keys or {})
+        guessed = guess_keys(features) if self.foreign else {}
+        if guessed := {k: v for k, v in guessed.items() if k not in given}:
+            note_guess(self.root, tuple(guessed.items()))
+        self._stored = stored_names(self.root, features, guessed | given)
         self.features: dict[str, dict[str, Any]] = {
-            key: feature for key, feature in info["features"].items() if key not in INDEX_DTYPES
+            key: features[stored] for key, stored in self._stored.items()
         }
-        table = set_files.load_table(self.root, set_files.EPISODES, leave_out="stats/")
-        set_files.refuse_other_writers(self.root, info["features"], table)
-        self._rows: list[Row] = table.slice(0, info["total_episodes"]).to_pylist()
-        if len(self._rows) < info["total_episodes"]:
-            raise UserError(
-                f"{self.root / set_files.EPISODES} lists {len(self._rows)} of "
-                f"{info['total_episodes']} episodes: {set_files.repair_command(self.root)}"
-            )
-        for row in self._rows if complete else ():  # before any work with the others
-            for name in self._files(row):
-                if not (self.root / name).is_file():
-                    raise set_files.unreadable(self.root, name, FileNotFoundError())
+        self._places = episode_table.locate_episodes(self.root, info, table)
+        files = {name for place in self._places for name in place.files} if complete else ()
+        for name in files:  # before any work with the others
+            if not (self.root / name).is_file():
+                raise self._unreadable(name, FileNotFoundError())
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._places)
 
     @cached_property
     def checksum(self) -> str:
         """SHA-256 of the set, independent of its folder.
 
-        It covers every episode's length, task, meta, statistics and checksums of videos.
+        It covers every episode's length, task, meta, statistics and checksums of videos; of a foreign
+        set all frames.
         """
-        table = set_files.load_table(self.root, set_files.EPISODES).slice(0, len(self))
-        return hashlib.sha256(json.dumps(table.to_pylist(), sort_keys=True).encode()).hexdigest()
+        if self.foreign:
+            content: Any = [self.episode_checksum(i) for i in range(len(self))]
+        else:
+            content = self._table.to_pylist()
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    @cached_property
+    def _table(self) -> pa.Table:
+        """meta/episodes with statistics."""
+        return set_files.load_table(self.root, set_files.EPISODES).slice(0, len(self))
 
     @property
     def lengths(self) -> list[int]:
         """Number of frames of every episode."""
-        return [row["length"] for row in self._rows]
+        return [place.length for place in self._places]
 
     def episode_checksum(self, i: int) -> str:
-        """Return the SHA-256 of episode i's length, meta and checksums of videos.
+        """Return the SHA-256 of the content of episode i.
 
-        It does not change when the set moves or grows.
+        It does not change when the set moves or grows. Of touchgoal's own episodes it covers length,
+        task, meta, statistics of every feature and checksums of videos; of others all stored frames.
         """
-        content = {
-            key: value
-            for key, value in self._row(i).items()
-            if key == "length" or key.startswith(set_files.META_PREFIX) or key.endswith("/crc32")
-        }
+        place = self._place(i)
+        if self.foreign:
+            content: dict[str, Any] = self._content_checksums(place)
+        else:
+            indices = tuple(f"stats/{key}/" for key in INDEX_DTYPES)
+            content = {
+                key: value
+                for key, value in self._table.slice(i, 1).to_pylist()[0].items()
+                if key in ("length", "tasks")
+                or key.endswith("/crc32")
+                or (
+                    key.startswith((set_files.META_PREFIX, "stats/"))
+                    and not key.startswith(indices)
+                )
+            }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def frame_checksums(self, i: int, key: str) -> frozenset[int]:
         """Return checksums of the frames of a feature of episode i, comparable in this process."""
-        if not is_image(key):
+        if self.features[key]["dtype"] != "image":
             return frozenset(hash(values.tobytes()) for values in self.read(i, [key]).frames[key])
-        name = set_files.data_path(set_files.file_number_of(self._row(i)))
-        try:
-            with pq.ParquetFile(self.root / name, page_checksum_verification=True) as file:
-                images = file.read([f"{key}.bytes"])[key].combine_chunks().field("bytes")
-                return frozenset(hash(image.as_py()) for image in images)
-        except (OSError, pa.ArrowException) as error:
-            raise set_files.unreadable(self.root, name, error) from error
+        images = self._stored_column(self._place(i), self._stored[key]).field("bytes")
+        return frozenset(hash(image.as_py()) for image in images)
 
     def meta(self, i: int) -> dict[str, MetaValue]:
-        """Return the facts about episode i."""
-        prefix = set_files.META_PREFIX
-        row = self._row(i)
-        return {k.removeprefix(prefix): v for k, v in row.items() if k.startswith(prefix)}
+        """Return the facts about episode i; lerobot records none."""
+        prefix, facts = set_files.META_PREFIX, self._place(i).facts.items()
+        return {
+            k.removeprefix(prefix): v for k, v in facts if k.startswith(prefix) and v is not None
+        }
 
     def task(self, i: int) -> str:
-        """Return the instruction of episode i."""
-        return self._row(i)["tasks"][0]
+        """Return the instruction of episode i; "" if none is recorded."""
+        return (self._place(i).facts["tasks"] or [""])[0]
+
+    def time_stamps(self, i: int) -> Float32[np.ndarray, " n"]:
+        """Return the time of every frame of episode i as stored, s from its start."""
+        return self._stored_column(self._place(i), "timestamp").to_numpy(zero_copy_only=False)
+
+    def video_length(self, i: int, key: str) -> tuple[int, int, float]:
+        """Return the frames that camera `key` has for episode i by its time stamps and by its file.
+
+        Third is the rate of the video, frames per second. UserError: the video is unreadable.
+        """
+        place = self._place(i).videos[self._stored[key]]
+        with self._readable(place.file):
+            length, fps = video_length(self.root / place.file)
+        return place.n_frames, length - place.first_frame, fps
 
     def read(
         self, i: int, keys: Sequence[str] | None = None, frames: Sequence[int] | None = None
@@ -212,47 +261,106 @@ class EpisodeSet:
         Raises:
             UserError: No such episode, key or frame; a file is missing or corrupt.
         """
-        row = self._row(i)
+        place = self._place(i)
         keys = list(self.features) if keys is None else keys
         if unknown := [key for key in keys if key not in self.features]:
             raise UserError(f"{self.root} has no {unknown[0]}; it has {', '.join(self.features)}")
-        wanted = np.arange(row["length"]) if frames is None else np.asarray(frames, np.int64)
-        outside = wanted[(wanted < 0) | (wanted >= row["length"])]
+        wanted = np.arange(place.length) if frames is None else np.asarray(frames, np.int64)
+        outside = wanted[(wanted < 0) | (wanted >= place.length)]
         if len(outside):
             raise UserError(
-                f"episode {i} of {self.root} has frames 0 to {row['length'] - 1}, not {outside[0]}"
+                f"episode {i} of {self.root} has frames 0 to {place.length - 1}, not {outside[0]}"
             )
-        columns = {key: self.features[key] for key in keys if not is_camera(key)}
-        read = self._read_data(row, columns, wanted) if columns else {}
-        read |= {key: self._read_video(row, key, wanted) for key in keys if is_camera(key)}
+        videos = [key for key in keys if self.features[key]["dtype"] == "video"]
+        columns = {self._stored[key]: self.features[key] for key in keys if key not in videos}
+        stored = self._read_data(i, columns, wanted) if columns else {}
+        read = {key: stored[self._stored[key]] for key in keys if key not in videos}
+        read |= {key: self._read_video(place, self._stored[key], wanted) for key in videos}
         return Episode({key: read[key] for key in keys}, self.task(i), self.meta(i))
 
     def __repr__(self) -> str:
         return f"EpisodeSet({str(self.root)!r}: {len(self)} episodes, {', '.join(self.features)})"
 
-    def _files(self, row: Row) -> list[str]:
-        number = set_files.file_number_of(row)
-        videos = [set_files.video_path(key, number) for key in self.features if is_camera(key)]
-        return [set_files.data_path(number), *videos]
-
-    def _row(self, i: int) -> Row:
+    def _place(self, i: int) -> EpisodePlace:
         if not 0 <= i < len(self):
             raise UserError(f"{self.root} has episodes 0 to {len(self) - 1}, not {i}")
-        return self._rows[i]
+        return self._places[i]
+
+    def _unreadable(self, name: str, error: Exception) -> UserError:
+        """Return the error that a file is missing or broken; only own sets can be repaired."""
+        if not self.foreign:
+            return set_files.unreadable(self.root, name, error)
+        missing = isinstance(error, FileNotFoundError)
+        reason = "missing" if missing else f"corrupt ({str(error).splitlines()[0]})"
+        return UserError(f"{self.root / name} is {reason}: copy the set again")
+
+    @contextmanager
+    def _readable(self, name: str) -> Iterator[None]:
+        """Name the file in whatever goes wrong while it is read."""
+        try:
+            yield
+        except UserError as error:
+            raise UserError(f"{self.root / name}: {error}") from error
+        except (OSError, pa.ArrowException, av.error.FFmpegError, ValueError) as error:
+            raise self._unreadable(name, error) from error
 
     def _read_data(
-        self, row: Row, features: dict[str, dict[str, Any]], frames: np.ndarray
+        self, i: int, features: dict[str, dict[str, Any]], frames: np.ndarray
     ) -> dict[str, np.ndarray]:
-        name = set_files.data_path(set_files.file_number_of(row))
-        try:
-            with pq.ParquetFile(self.root / name, page_checksum_verification=True) as file:
-                if file.metadata.num_rows != row["length"]:
-                    raise OSError(f"{file.metadata.num_rows} frames instead of {row['length']}")
-                return read_columns(file, features, frames)
-        except (OSError, pa.ArrowException) as error:
-            raise set_files.unreadable(self.root, name, error) from error
+        place = self._place(i)
+        with (
+            self._readable(place.data_file),
+            pq.ParquetFile(self.root / place.data_file, page_checksum_verification=True) as file,
+        ):
+            rows = file.metadata.num_rows
+            if place.alone and rows != place.length:
+                raise OSError(f"{rows} frames instead of {place.length}")
+            if rows < place.first_row + place.length:
+                raise OSError(f"{rows} frames, too few for episode {i}")
+            return read_columns(file, features, frames + place.first_row)
 
-    def _read_video(self, row: Row, key: str, frames: np.ndarray) -> UInt8[np.ndarray, "n h w 3"]:
-        name = set_files.video_path(key, set_files.file_number_of(row))
-        video = set_files.read_video(self.root, name, row[f"videos/{key}/crc32"])
-        return decode_video(video, self.fps, frames.tolist())
+    def _stored_column(self, place: EpisodePlace, name: str) -> pa.Array:
+        """Return a column of the data file, of the rows of one episode."""
+        with (
+            self._readable(place.data_file),
+            pq.ParquetFile(self.root / place.data_file, page_checksum_verification=True) as file,
+        ):
+            column = file.read([name])[name].slice(place.first_row, place.length)
+            return pa.concat_arrays(column.chunks)
+
+    def _content_checksums(self, place: EpisodePlace) -> dict[str, Any]:
+        """Return checksums of everything that is stored of an episode but its place in the set."""
+        found: dict[str, Any] = {"tasks": place.facts["tasks"]}
+        for key, feature in self.features.items():
+            stored = self._stored[key]
+            if feature["dtype"] == "video":
+                video = place.videos[stored]
+                with self._readable(video.file):
+                    found[stored] = video_checksum(
+                        self.root / video.file, self.fps, video.first_frame, place.length
+                    )
+            else:
+                values = self._stored_column(place, stored).to_pylist()
+                found[stored] = zlib.crc32(repr(values).encode())
+        return found
+
+    def _read_video(
+        self, place: EpisodePlace, stored: str, frames: np.ndarray
+    ) -> UInt8[np.ndarray, "n h w 3"]:
+        video = place.videos[stored]
+        source: bytes | Path = self.root / video.file
+        if not self.foreign and video.crc32 is not None:
+            source = set_files.read_video(self.root, video.file, video.crc32)
+        with self._readable(video.file):
+            return decode_video(source, self.fps, (frames + video.first_frame).tolist())
+
+
+def load_episodes(
+    path: str | os.PathLike[str], keys: Mapping[str, str] | None = None
+) -> EpisodeSet:
+    """Open a set of episodes that touchgoal or lerobot wrote; see `EpisodeSet`.
+
+    episodes = touchgoal.load_episodes("my_set", {"observation.images.top": "observation.images.front"})
+    episodes.read(0).frames["observation.images.front"]  # (T, height, width, 3)
+    """
+    return EpisodeSet(path, keys=keys)

@@ -10,7 +10,6 @@ its checksum, so that everything under meta/ can be rebuilt from the data files 
 import io
 import json
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -200,9 +199,16 @@ def _to_arrow(key: str, column: Shaped[np.ndarray, "n d"] | list[bytes]) -> pa.A
 def read_columns(
     file: pq.ParquetFile, features: dict[str, dict[str, Any]], frames: Int[np.ndarray, " n"]
 ) -> dict[str, Shaped[np.ndarray, "n ..."]]:
-    """Read some columns of some frames of a data file, in any order; nothing else is decoded."""
+    """Read some columns of some rows of a data file, in any order; nothing else is decoded.
+
+    `features` are as in info.json; `frames` are rows of the file. ValueError: a column does not hold
+    what its feature says.
+    """
     out = {
-        key: np.empty((len(frames), *feature["shape"]), FEATURES[key].dtype)
+        key: np.empty(
+            (len(frames), *feature["shape"]),
+            np.uint8 if feature["dtype"] == "image" else feature["dtype"],
+        )
         for key, feature in features.items()
     }
     if not features:
@@ -214,18 +220,17 @@ def read_columns(
         table = file.read_row_group(int(group), columns=list(features))
         where = np.flatnonzero(group_of == group)
         rows = frames[where] - (ends[group] - sizes[group])
-        for key in features:
-            shape = features[key]["shape"]
-            out[key][where] = _from_arrow(key, shape, table[key].combine_chunks(), rows)
+        for key, feature in features.items():
+            out[key][where] = _from_arrow(feature, table[key].combine_chunks(), rows)
     return out
 
 
 def _from_arrow(
-    key: str, shape: list[int], column: pa.Array, rows: Sequence[int] | Int[np.ndarray, " n"]
+    feature: dict[str, Any], column: pa.Array, rows: Int[np.ndarray, " n"]
 ) -> Shaped[np.ndarray, "n ..."]:
-    if is_image(key):
+    if feature["dtype"] == "image":
         png = column.field("bytes")
         return np.stack([decode_png(png[int(row)].as_py()) for row in rows])
-    if not pa.types.is_primitive(column.type):
+    while not pa.types.is_primitive(column.type):
         column = column.flatten()
-    return column.to_numpy(zero_copy_only=False).reshape(-1, *shape)[rows]
+    return column.to_numpy(zero_copy_only=False).reshape(-1, *feature["shape"])[rows]

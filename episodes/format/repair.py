@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import Description, read_description, write_table
+from touchgoal.episodes.format.foreign import foreign_data_file, foreign_file, refusal
 from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
@@ -78,8 +79,8 @@ def _require_own_set(root: Path) -> None:
         with suppress(UserError):  # damaged: it is rebuilt from the data files
             info = set_files.load_json(root, set_files.INFO)
         set_files.check_version(root, info)
-    set_files.refuse_other_writers(root, {}, None)
-    set_files.refuse_foreign_data_files(root)
+    if path := foreign_file(root, {}, None) or foreign_data_file(root):
+        raise refusal(root, path)
 
 
 def validate(root: str | os.PathLike[str]) -> list[str]:

@@ -2,16 +2,13 @@
 
 import sys
 import zlib
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from touchgoal.control.features import FEATURES
-from touchgoal.episodes.format.encoding import has_description
-from touchgoal.episodes.schema import INDEX_DTYPES, drop_pixel_format
+from touchgoal.episodes.schema import drop_pixel_format
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.json_file import parse_json
 
@@ -55,6 +52,20 @@ def video_path(key: str, file_number: int) -> str:
     )
 
 
+def data_path_of(row: Row) -> str:
+    """Return the path in the set of the data file that holds an episode of meta/episodes."""
+    return DATA_PATH.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
+
+
+def video_path_of(row: Row, key: str) -> str:
+    """Return the path in the set of the video that holds camera `key` of an episode."""
+    return VIDEO_PATH.format(
+        video_key=key,
+        chunk_index=row[f"videos/{key}/chunk_index"],
+        file_index=row[f"videos/{key}/file_index"],
+    )
+
+
 def file_number_of(row: Row) -> int:
     """Return the number of an episode's files; after a repair it may exceed the episode's index."""
     return row["data/chunk_index"] * CHUNK + row["data/file_index"]
@@ -91,8 +102,19 @@ def load_info(root: Path) -> dict[str, Any]:
             wrong.append(f"{key} = {value!r}")
     if wrong:
         raise unreadable(root, INFO, ValueError(f"wrong {', '.join(wrong)}"))
+    _check_paths(root, info)
     drop_pixel_format(info["features"])
     return info
+
+
+def _check_paths(root: Path, info: dict[str, Any]) -> None:
+    """Raise UserError unless paths are LeRobot's defaults, filled in with keys that are plain names."""
+    for name, usual in (("data_path", DATA_PATH), ("video_path", VIDEO_PATH)):
+        if info.get(name) not in (None, usual):
+            raise UserError(f"{root / INFO}: {name} is {info[name]!r}; touchgoal reads {usual!r}")
+    for key in info["features"]:
+        if set(key) & set("/\\\0") or key in ("", ".", ".."):
+            raise unreadable(root, INFO, ValueError(f"{key!r} cannot name a feature"))
 
 
 def check_version(root: Path, info: dict[str, Any]) -> None:
@@ -134,53 +156,6 @@ def unreadable(root: Path, name: str, error: Exception) -> UserError:
         return UserError(f"{root / name} is missing: {repair_command(root)}")
     reason = str(error).splitlines()[0]
     return UserError(f"{root / name} is corrupt ({reason}): {repair_command(root)}")
-
-
-def refuse_other_writers(root: Path, features: dict[str, Any], episodes: pa.Table | None) -> None:
-    """Raise UserError if lerobot wrote the set or added episodes to it.
-
-    touchgoal writes one file under meta/episodes, and one data file an episode with a description
-    in its footer; lerobot puts several episodes into a file and begins further files. `episodes` is
-    None if it cannot be read.
-    """
-    listed = (root / "meta/episodes").rglob("*.parquet")
-    if others := sorted(path for path in listed if path != root / EPISODES):
-        raise written_by_others(root, others[0])
-    if unknown := sorted(set(features) - {*FEATURES, *INDEX_DTYPES}):
-        refuse_foreign_data_files(root, if_none=root / INFO)
-        raise unreadable(root, INFO, ValueError(f"unknown feature {unknown[0]!r}"))
-    if episodes is None:
-        return
-    places = episodes.select(["data/chunk_index", "data/file_index"]).to_pylist()
-    cameras = [key for key, feature in features.items() if feature["dtype"] == "video"]
-    unchecked = any(f"videos/{key}/crc32" not in episodes.column_names for key in cameras)
-    if unchecked or len({file_number_of(row) for row in places}) < len(places):
-        refuse_foreign_data_files(root, if_none=root / EPISODES)
-        raise unreadable(root, EPISODES, ValueError("wrong places of files"))
-
-
-def refuse_foreign_data_files(root: Path, if_none: Path | None = None) -> None:
-    """Raise UserError if touchgoal did not write one of the data files that can be read.
-
-    Where none can be read, the file `if_none` is blamed; without it that is allowed.
-    """
-    own = False
-    for path in sorted((root / "data").rglob("*.parquet")):
-        with suppress(OSError, pa.ArrowException), pq.ParquetFile(path) as file:
-            if not has_description(file):
-                raise written_by_others(root, path)
-            own = True
-    if not own and if_none is not None:
-        raise written_by_others(root, if_none)
-
-
-def written_by_others(root: Path, path: Path) -> UserError:
-    """Return the error that touchgoal did not write a file of a set."""
-    return UserError(
-        f"{root} holds episodes that lerobot wrote (see {path}); touchgoal reads only its own and "
-        "changes nothing here: use the set with lerobot, or append its episodes to a new set with "
-        "touchgoal's EpisodeWriter (docs/data_format.md)"
-    )
 
 
 def last_row(table: pa.Table | None) -> Row:

@@ -10,6 +10,7 @@ import gymnasium
 
 if TYPE_CHECKING:
     from touchgoal.encoders.pretrained import load_encoder as load_encoder
+    from touchgoal.episodes.store import load_episodes as load_episodes
     from touchgoal.policies.checkpoint import load_policy as load_policy
     from touchgoal.policies.evaluation.evaluate import evaluate as evaluate
     from touchgoal.rewards.api import reward_curve as reward_curve
@@ -46,6 +47,7 @@ _INTERFACE = {  # one call a job, imported at its first use: `import touchgoal` 
     "evaluate": "touchgoal.policies.evaluation.evaluate",
     "load_encoder": "touchgoal.encoders.pretrained",
     "load_policy": "touchgoal.policies.checkpoint",
+    "load_episodes": "touchgoal.episodes.store",
     "make": "touchgoal.sim_envs.tasks",
     "reward_curve": "touchgoal.rewards.api",
 }

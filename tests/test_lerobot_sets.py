@@ -1,0 +1,103 @@
+"""Sets in lerobot's layout are read: several episodes a file, any keys; faults are named."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot_layout import Frames, toy_frames, write_lerobot_set
+
+import touchgoal
+from touchgoal.control import features as ft
+from touchgoal.episodes.faults import find_faults, leave_out_faulty
+from touchgoal.episodes.format import set_files
+from touchgoal.episodes.media import write_video
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.runtime.errors import UserError
+
+TOP = "observation.images.top"
+
+
+@pytest.fixture
+def foreign(tmp_path: Path) -> Path:
+    write_lerobot_set(tmp_path / "foreign", [toy_frames(i, 24 + i) for i in range(3)])
+    return tmp_path / "foreign"
+
+
+def test_rows_and_frames_of_each_episode(foreign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    episodes = touchgoal.load_episodes(foreign, {TOP: ft.FRONT})
+    assert "gelsight_left=observation.images.tactile_left" in capsys.readouterr().err
+    assert (len(episodes), episodes.fps, episodes.lengths) == (3, 15, [24, 25, 26])
+    assert set(episodes.features) == {ft.FRONT, *ft.TACTILE, ft.STATE, ft.ACTION}, "no texts"
+    for i in (2, 0, 1):
+        written, frames = toy_frames(i, 24 + i), [23, 4, 11, 5]
+        read = episodes.read(i, frames=frames).frames
+        np.testing.assert_array_equal(read[ft.STATE], written["observation.state"][frames])
+        assert read[ft.ACTION].dtype == np.float32
+        off = read[ft.FRONT].astype(int) - written[TOP][frames]
+        assert np.abs(off).mean() < 4 and abs(off[..., 0].mean()) < 2, "a frame's step is 4"
+    with pytest.raises(UserError, match="lerobot wrote .* changes nothing here"):
+        EpisodeWriter(foreign, 15)
+    with pytest.raises(UserError, match="has no observation.images.side"):
+        EpisodeSet(foreign, keys={"observation.images.side": ft.FRONT})
+
+
+def test_checksums_are_of_the_content(foreign: Path, tmp_path: Path) -> None:
+    """Episodes of equal length and numbers whose pictures alone differ are not the same."""
+    other = [toy_frames(i, 24 + i) for i in range(3)]
+    other[1]["observation.images.gelsight_left"] = other[1][TOP]
+    write_lerobot_set(tmp_path / "other", other)
+    sums = [
+        [EpisodeSet(r).episode_checksum(i) for i in range(3)] for r in (foreign, tmp_path / "other")
+    ]
+    assert [a == b for a, b in zip(*sums, strict=True)] == [True, False, True]
+    assert EpisodeSet(foreign).checksum != EpisodeSet(tmp_path / "other").checksum
+
+
+def _stamps(change: Callable[[np.ndarray], object]) -> Callable[[Frames], None]:
+    def spoil(frames: Frames) -> None:
+        frames["timestamp"] = (np.arange(len(frames["action"])) / 15).astype(np.float32)
+        change(frames["timestamp"])
+
+    return spoil
+
+
+def _set(key: str, frame: int, value: float) -> Callable[[Frames], None]:
+    return lambda frames: frames[key].__setitem__((frame, 2), value)
+
+
+FAULTS = {
+    "frame 9 has the time stamp 1.6": _stamps(lambda t: t.__setitem__(slice(9, None), t[9:] + 1)),
+    "frame 6 has the time stamp 0.333 s after 0.333": _stamps(lambda t: t.__setitem__(6, t[5])),
+    "observation.state is not finite at frame 7": _set("observation.state", 7, np.nan),
+    "": _stamps(lambda t: np.add(t, np.random.default_rng(0).uniform(-0.02, 0.02, len(t)), t)),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_named_and_left_out(
+    tmp_path: Path, fault: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded = [toy_frames(i) for i in range(3)]
+    for frames in recorded:
+        _stamps(lambda t: None)(frames)
+    FAULTS[fault](recorded[1])
+    write_lerobot_set(tmp_path, recorded)
+    episodes = EpisodeSet(tmp_path)
+    left = leave_out_faulty(episodes, range(3), [ft.STATE])
+    assert left == ([0, 2] if fault else [0, 1, 2]), "jitter below half a frame is none"
+    assert not fault or f"episode 1 of {tmp_path}: {fault}" in capsys.readouterr().err
+    assert 1 not in find_faults(episodes, [1], [ft.ACTION]) or "state" not in fault
+
+
+def test_a_video_that_is_too_short_or_of_another_rate(foreign: Path) -> None:
+    path = foreign / set_files.video_path(TOP, 0)
+    write_video(path, toy_frames(0, 60)[TOP], 15)
+    episodes = EpisodeSet(foreign)
+    assert find_faults(episodes, [1, 2], [TOP]) == {
+        2: f"episode 2 of {foreign}: {TOP} ends at frame 11, the table at frame 26"
+    }
+    with pytest.raises(UserError, match="the video has no frame 60"):
+        episodes.read(2, [TOP])
+    write_video(path, toy_frames(0, 75)[TOP], 30)
+    assert "30 frames per second" in find_faults(EpisodeSet(foreign), [0], [TOP])[0]
