@@ -42,7 +42,7 @@ _ROBOT_BIT, _HOLE_BIT = 1, 4
 class BeadMaze(FrankaTactileEnv):
     """Grasp the bead, around which the hand starts open, and lead it to the wire's other end.
 
-    The first frames of the fingertips are untouched, as every task's. A fixture holds the bead
+    The first frames of the fingertips are untouched, as in every task. A fixture holds the bead
     for `GRASP_SECONDS`: on a slope it would slide off while the fingers close.
 
     `reset` takes the options of `BeadMazeReset`.
@@ -54,7 +54,7 @@ class BeadMaze(FrankaTactileEnv):
     task = "bead-maze"
     config: BeadMazeConfig
     default_config = BeadMazeConfig()
-    disturbance_rotation = 20.0  # rad of disturbance per m of it: the hole turns with the hand
+    disturbance_rotation = 20.0  # rad per m of disturbance: the hole turns with the hand
 
     @property
     def grasping(self) -> bool:
@@ -173,8 +173,8 @@ def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
         "group": VISUAL_GROUP,
         "rgba": [0.75, 0.76, 0.8, 1],
     }
-    spec.visual.quality.numstacks = 6  # with 16, capsules take most of a render's time, to no use
-    maze = spec.worldbody.add_body(name="wire")  # a body of its own: one box to rule it out
+    spec.visual.quality.numstacks = 6  # with 16, capsules take most of a render's time
+    maze = spec.worldbody.add_body(name="wire")  # own body: one bounding box to rule it out
     for start, end in wire.chords(sag=_SAG, longest=0.012):
         maze.add_geom(size=[WIRE_RADIUS, 0, 0], fromto=[*start, *end], **steel)
     for foot in wire.points[[0, -1]]:

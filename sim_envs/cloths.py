@@ -1,6 +1,6 @@
 """Twenty cloths pressed into a fingertip sensor by hand, for TacBench T6 (textile).
 
-Every clip is one press that deepens and drifts, on another piece of its cloth and another body.
+Every clip is one press that deepens and drifts; each has its own piece of cloth and body.
 """
 
 from collections.abc import Callable

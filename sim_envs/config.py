@@ -151,7 +151,7 @@ LightChange = Annotated[tuple[BrightnessChange, ...], AfterValidator(_one_or_thr
 class DeploymentConfig:
     """Delays and dynamics of a real arm, drawn for each episode.
 
-    Options not given follow `--env.as-deployed`: as over the wire with it, none without.
+    Options not given follow `--env.as-deployed`: with it they are as over the wire, without it off.
     """
 
     tracker: bool | None = None
@@ -286,12 +286,12 @@ class PickPlaceReset:
     grasp_force: Force | None = None
     """Force of each finger, N."""
     asked: ObjectName | None = None
-    """Object that the instruction asks for where another lies on the table; placing that one is no
-    success."""
+    """Object that the instruction asks for, while another lies on the table; placing that other one
+    is no success."""
     start: Place | None = None
     """Where the object starts, m, base frame."""
     goal: Place | None = None
-    """Where it shall be placed, m, base frame."""
+    """Where to place the object, m, base frame."""
 
 
 @checked_dataclass
@@ -314,7 +314,7 @@ class BeadMazeConfig(EnvConfig):
     n_wires: Count | None = None
     """Number of wires to draw from; default: 200, or all if the split has fewer."""
     bead: Literal["sphere", "cylinder"] = "sphere"
-    """Shape of the bead; the wire turns a cylinder by a torque, a sphere hardly."""
+    """Shape of the bead; the wire exerts a torque on a cylinder, hardly on a sphere."""
     grasp_force: ForceRange = (8.0, 12.0)
     """Range of the force of each finger, N."""
     start_angle: Annotated[NotNegative, Field(le=45)] = 0.0

@@ -26,7 +26,7 @@ _MASS, _GRIP = (0.1, 1.0), (0.8, 10.0)  # kg, N of each finger: drawn log-unifor
 _ASIDE, _ABOVE = 8e-3, (-4e-3, 10e-3)  # m from the object's middle, along the pads and upwards
 _TURN = math.radians(12)  # largest turn of the object against the pads
 _OPEN, _CLOSING, _LIFTING = 0.04, 0.08, 0.1  # m of one finger; m/s of one finger; m/s
-_LOOKS = 0.05  # s between two looks at the pads, whose stick and slip have a memory
+_LOOKS = 0.05  # s between readings of the pads, whose stick and slip depend on earlier readings
 _SHOWN_AT, _TOP = 0.01, 0.06  # m of lift
 _SHAKE, _SHAKES, _SHAKING = 0.012, 3.0, 1.0  # m, Hz, s
 _LOWEST = 0.018  # m: lowest height of the pads' middle above the table
@@ -39,7 +39,7 @@ class GraspAttempt:
     # left, right: the fingertips' pictures at `MOMENTS`, RGB
     left: UInt8[np.ndarray, "3 h w 3"]
     right: UInt8[np.ndarray, "3 h w 3"]
-    # force (N) and torque (Nm) of the object on the left pad, then the right one, then
+    # force (N) and torque (Nm) of the object on the left, then the right pad, at `MOMENTS`
     wrench: Float32[np.ndarray, "3 12"]
     held: bool  # whether the object is still in the hand after the shake
     body: Body  # the object

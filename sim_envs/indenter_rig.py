@@ -1,9 +1,9 @@
 """An indenter rig: a probe pressed into one fingertip sensor and drawn over it, without a robot.
 
 After the load test of Sparsh (Higuera et al. 2024, appendix C.4): a press of at most 5 N, a slide
-of at most 2 mm. What differs: a slide is about as long as friction holds, so that sticking and
-slipping are both common, and there is no dynamics. While the probe sticks, the gel goes along and
-its shear force grows; at the friction cone the probe slides.
+of at most 2 mm. Unlike in that test, a slide is about as long as the distance that friction holds,
+so that sticking and slipping are both common, and there is no dynamics. While the probe sticks, the
+gel moves along and its shear force grows; at the friction cone the probe slides.
 """
 
 import math
@@ -22,11 +22,11 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_in
 FPS = 60
 """Pictures a second, a DIGIT's."""
 FRICTION = 0.6
-"""Coefficient that the experimenter takes for all strokes: the nominal friction cone."""
+"""Nominal friction coefficient, which references assume for all strokes."""
 FRICTION_SPREAD = 0.15
 """Largest relative deviation of a stroke's friction from `FRICTION`."""
 REST = 6
-"""Untouched frames at the start of a stroke: one more than lie between frames of a pair."""
+"""Untouched frames at the start of a stroke: the first pair of frames, 5 apart, is untouched."""
 MAX_SLIDE = 2e-3  # m
 _PLACES = 3e-3  # m from the middle of the picture, along x and y
 _PRESS_FRAMES = 8, 16
@@ -81,7 +81,7 @@ def shear_force(
 ) -> tuple[Float[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
     """Return tangential force (N) on a gel of `stiffness` N/m, and slip, by frame.
 
-    The gel follows the probe until friction gives way; what the probe has slid stays slid.
+    The gel follows the probe until friction gives way; after a slide it rests at a new place.
 
     Args:
         moved: how far the probe has been drawn, m.

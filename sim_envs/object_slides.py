@@ -1,8 +1,8 @@
 """Objects held against one fingertip sensor and slid and turned under it by hand.
 
-As in Sparsh's appendix C.5 the load holds and the velocity changes every fraction of a second.
-Changes of the pose over five frames are drawn log-uniformly. Stick and slip are the indenter rig's,
-with torsion: a patch is turned in the gel as a ring of its mean radius is drawn along it.
+As in Sparsh's appendix C.5 the load is constant and the velocity changes every fraction of a
+second. Changes of the pose over five frames are drawn log-uniformly. Stick and slip are the
+indenter rig's, with torsion: a turn counts as the way along a ring of the patch's mean radius.
 """
 
 import math
@@ -32,7 +32,7 @@ HeldObject = Literal["bar", "can"]
 HELD: tuple[HeldObject, ...] = ("bar", "can")
 FRAMES = 60
 """Frames of a slide, after the untouched ones."""
-_SEGMENT = 6, 13  # frames of one velocity, least and one more than most
+_SEGMENT = 6, 13  # frames of one velocity, half-open range
 _WINDOW = 5  # frames over which changes are drawn
 _SHIFTS, _TURNS = (0.03e-3, 8e-3), (math.radians(0.02), math.radians(4))  # least and most change
 _MASS = 0.1  # kg: slides have no dynamics
@@ -112,9 +112,9 @@ def pulled(
 ) -> tuple[Float[np.ndarray, "t d"], Bool[np.ndarray, " t"]]:
     """Return forces (N) on a gel of `stiffness` N/m under an object at these places (m), and slip.
 
-    The gel's point of rest is drawn along as soon as it would pull with more than `limit` N.
-    `places`: x, y and, if it turns, the way along a ring of the patch's mean radius; its force is
-    torsion over that radius.
+    The gel's rest position is dragged along where the force would exceed `limit` N. `places`: x, y
+    and, for turns, angle times the patch's mean radius; the third force is torsion over that
+    radius.
     """
     rest = places[0].astype(float)
     force, slip = np.zeros(places.shape), np.zeros(len(places), bool)
@@ -168,8 +168,8 @@ def _random_side(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
         rotation = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)
     else:
         rotation, triangle = np.linalg.qr(rng.normal(size=(3, 3)))
-        rotation *= np.sign(np.diag(triangle))  # so that all are alike
-    rotation[:, 0] *= np.linalg.det(rotation)  # no mirror
+        rotation *= np.sign(np.diag(triangle))  # makes the rotation uniformly random
+    rotation[:, 0] *= np.linalg.det(rotation)  # a rotation, not a mirror
     return rotation
 
 

@@ -17,8 +17,8 @@ def with_options(config: Config, options: Mapping[str, Any]) -> Config:
 
     Args:
         config: a dataclass.
-        options: new values by field name; of a field that is a config itself (`randomization`)
-            either a config or a mapping of the fields of it that change.
+        options: new values by field name; for a nested config (`randomization`), a config or a
+            mapping of its fields that change.
     """
     assert is_dataclass(config) and not isinstance(config, type)
     names = [field.name for field in fields(config)]

@@ -16,7 +16,7 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE, find, sample_body
 
 WORKSPACE = ((0.40, 0.60), (-0.20, 0.20))  # m, where objects start and goals lie, base frame
 _LIFTED = 0.03  # m above rest that counts as picked up
-_MOST_MISSES = 200  # draws too near to another place, before all are drawn again
+_MOST_MISSES = 200  # draws too near to another place, after which all places are drawn again
 _APART = 0.12  # m at least between objects, and between start and goal
 
 
@@ -62,7 +62,8 @@ class PickPlace(FrankaTactileEnv):
     def rearrange(self) -> tuple[Observation, dict[str, Any]]:
         """Start a new episode with the same objects, without the cost of a reset.
 
-        Objects, goal and hand are moved to places that a reset could draw, the objects as they lie.
+        Objects, goal and hand are moved to places that a reset could draw; objects keep the side
+        they lie on.
         """
         rng, data = self.np_random, self.data
         *positions, self.goal = _random_positions(rng, len(self.bodies) + 1)
@@ -151,7 +152,7 @@ class PickPlace(FrankaTactileEnv):
         held = all(pad.touching for pad in self.pad_contacts())
         let_go = not any(pad.touching for pad in self.pad_contacts())
         speed = float(np.abs(self.data.joint("object").qvel).max())
-        # Held and only grazing the table, the contact comes and goes; a millimetre is down, too.
+        # A held object that grazes the table loses contact at times: below 1 mm it is down, too.
         down = self.object_on_table() or height < 1e-3
         self._put_down = self._lifted and down
         there = self._put_down and away < self.config.tolerance and speed < 0.05
@@ -191,6 +192,6 @@ def _random_positions(rng: np.random.Generator, n: int) -> list[np.ndarray]:
             points.append(point)
         else:
             misses += 1
-        if misses == _MOST_MISSES:  # the first ones leave no room for the others
+        if misses == _MOST_MISSES:  # the first points leave no room for the others
             points, misses = [], 0
     return points

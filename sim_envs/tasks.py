@@ -29,7 +29,7 @@ def make(task: str, *, render_mode: str | None = None, **options: Any) -> Franka
         render_mode: "rgb_array" for wrappers that record videos.
         options: fields of the task's config by name, such as `cameras=("front",)`,
             `camera_size=(96, 96)` or `tactile=False`: see `PickPlaceConfig` and `BeadMazeConfig`.
-            Of a field that is a config itself a dict of what changes will do:
+            For a nested config, give a dict of the fields that change:
             `randomization={"gain": 0.0}`.
 
     Raises:

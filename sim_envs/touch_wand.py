@@ -1,7 +1,7 @@
 """The MMWand's bench as an environment: each step is one touch of an object with a wand.
 
 A GelSight Mini and a load cell on a stick, a camera beside them, and three cameras over a green
-bench (MMWand, section III). The wand is held by hand in life; here its pose and force are given.
+bench (MMWand, section III). A real wand is held by hand; here its pose and force are given.
 """
 
 from dataclasses import dataclass
@@ -30,8 +30,8 @@ _AWAY = 0.09  # m from the surface, before contact
 _LOWEST = np.radians(12)  # of the approach over the bench, rad
 _TILT = 0.2  # how far the wand leans from the surface's normal towards its approach
 _GRAZING = 0.3  # cosine between normal and approach below which the wand would slide off
-_FEELER = 0.5  # N of the first touch, by which the hand finds the object
-_FOLLOWED = 0.7  # share of the way to what it meets
+_FEELER = 0.5  # N of the light touch that finds the object's place on the gel
+_FOLLOWED = 0.7  # share of the way to the centre of that touch
 _CASE = 0.014  # m from the gel's middle to the case's side
 _PATCH = 0.015  # m, half the gel's diagonal
 
@@ -85,7 +85,8 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
     ## Observation space
 
     `Dict`: four views `observation.images.<top, side_left, side_right, wand>` (224, 224, 3),
-    `observation.images.tactile_left` and `observation.load` (N), at contact; after `reset` without.
+    `observation.images.tactile_left` and `observation.load` (N), at contact; after `reset`, before
+    contact.
 
     ## Reward
 
@@ -260,7 +261,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
     def _aim(
         self, point: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "3"]:
-        """Return where the gel's middle goes: a hand feels what it meets, and moves most of the way there."""
+        """Return where to put the gel's middle: most of the way to the centre of a light touch."""
         bench, pad = self.bench, self._pad
         assert pad is not None
         tip = point

@@ -21,8 +21,8 @@ _WRENCH_PERIOD = 10  # ms between estimates of the force on the hand
 _FORCE_PERIOD = 2  # ms between looks at the true force
 _HAND_PERIOD = round(1000 * PERIOD)  # ms
 _ARRIVED = 1e-3  # m
-_STILL = 2e-4  # m by which fingers move between two looks, and count as stopped
-_LEAST = 2  # looks for which any command runs
+_STILL = 2e-4  # m; fingers that move less between two looks have stopped
+_LEAST = 2  # looks before a command can end
 _AHEAD = 10  # ticks for which delays are drawn beyond an episode's end
 
 Joints = Float[np.ndarray, " n"]
@@ -215,7 +215,7 @@ class DeployedArm:
 
 
 def measurements_at_rest(q: Joints) -> Measurements:
-    """Return measurements at which the safety layer clamps but never stops: here tasks stop."""
+    """Return measurements at which the safety layer clamps but never stops: the task stops."""
     return Measurements(
         q=q,
         force=np.zeros(3),

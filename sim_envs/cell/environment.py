@@ -276,7 +276,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         return self._force.exceeded
 
     def _begin_episode(self) -> None:
-        """Start the episode's clock, force monitor and, as deployed, what lies before the arm."""
+        """Start the episode's clock, its force monitor and, as deployed, its `DeployedArm`."""
         self._ticks = 0
         self._force.reset()
         self._deployed: DeployedArm | None = None

@@ -21,9 +21,9 @@ from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
 GRIPPER_MAX_WIDTH = FRANKA_HAND.stroke[1]  # m, to which experts open
 GRIPPER_SPEED = FRANKA_HAND.speed  # m/s of width
-_FINGER_LAG = 1e-3  # m by which a finger may follow its set-point while it moves freely
+_FINGER_LAG = 1e-3  # m by which a freely moving finger lags its set-point, at most
 
-_QUIET = 2.0  # Nm: 20 N on a hand over the table, from any side, put more on some joint
+_QUIET = 2.0  # Nm; 20 N on a hand over the table, from any side, load some joint more
 
 
 class SimulatedHardware(ABC):
@@ -59,7 +59,7 @@ class SimulatedHardware(ABC):
         """
         travel = speed / 2 * steps * self.model.opt.timestep  # m of one finger
         self._finger_target += min(max(width / 2 - self._finger_target, -travel), travel)
-        # No wind-up while something holds the fingers open: letting go would take as long again.
+        # No wind-up while an object holds the fingers open: it would delay letting go.
         deepest = self.width() / 2 - 2 * self.grasp_force / self._finger_stiffness - _FINGER_LAG
         self._finger_target = max(self._finger_target, deepest)
         self.model.actuator_forcerange[self._gripper, 0] = -2 * self.grasp_force
@@ -97,7 +97,7 @@ class SimulatedHardware(ABC):
     def contact_force(self) -> Float[np.ndarray, "3"]:
         """Return the robot's contact force (N) in the last step, base frame; 0 if small.
 
-        Reading takes as long as a physics step: only where some joint bears more than `_QUIET`.
+        A reading takes as long as a physics step, so it needs more than `_QUIET` on some joint.
         """
         if np.abs(self.data.qfrc_constraint[self.arm_dofs]).max() < _QUIET:
             return np.zeros(3)

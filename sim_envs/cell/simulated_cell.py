@@ -18,7 +18,7 @@ from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
 
 DT = 1e-3  # s, of the Franka control interface and of the physics
 AT_REST = 0.01  # rad/s
-_ASIDE = 0.25, 0.4  # m, where on the table an object is put that is taken away
+_ASIDE = 0.25, 0.4  # m: place on the table for an object that is taken away
 # s, first order, our choice: how fast the arm's estimate of external torque follows, and how fast
 # an arm that was hit gives way.
 _TORQUE_FILTER_TIME = _YIELD_TIME = 0.02

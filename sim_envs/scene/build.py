@@ -158,7 +158,7 @@ def add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
 def _add_gel(
     spec: mujoco.MjSpec, finger: mujoco.MjsBody, side: str, sensor: SensorModel, z: float
 ) -> None:
-    mass, damping_ratio = 0.005, 0.7  # kg of gel; critically enough damped to not ring
+    mass, damping_ratio = 0.005, 0.7  # kg of gel; damped enough not to ring
     gel = finger.add_body(name=f"{side}_gel", pos=[0, 0, z], gravcomp=1)
     gel.explicitinertial = True
     gel.mass, gel.inertia = mass, np.full(3, 1e-6)
@@ -233,7 +233,7 @@ def _add_cameras_and_table(spec: mujoco.MjSpec, tool: Tool) -> None:
     world = spec.worldbody
     hand = spec.body("hand")
     hand.add_site(name="tcp", pos=[0, 0, tool.tcp_offset], group=HIDDEN_GROUP)
-    longer = tool.tcp_offset - FRANKA_HAND.tcp_offset  # the camera sees every tool's fingers alike
+    longer = tool.tcp_offset - FRANKA_HAND.tcp_offset  # keeps the view of the fingers
     eye = [0.075, 0.0, 0.02 + longer]
     hand.add_camera(
         name="wrist", pos=eye, quat=_look(eye, [0.012, 0, 0.17 + longer], [1, 0, 0]), fovy=62

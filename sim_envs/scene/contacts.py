@@ -55,7 +55,7 @@ class ContactReader:
     def read(
         self, data: mujoco.MjData
     ) -> tuple[tuple[PadContact, PadContact], Float[np.ndarray, "6"]]:
-        """Return the pads' contacts, and the wrench (N, Nm) of all outside on the robot at the TCP.
+        """Return the pads' contacts, and the external wrench (N, Nm) on the robot at the TCP.
 
         The wrench is in the base frame.
         """

@@ -134,7 +134,7 @@ def find(name: str) -> Wire:
 
 
 def choose(split: Split, count: int, families: tuple[Family, ...] = TRAINED) -> list[Wire]:
-    """Return the first `count` wires of a split, families in turn; more begin with the same ones.
+    """Return the first `count` wires of a split, families in turn; fewer are a prefix of more.
 
     Within a family no two wires of any split are closer than `APART`.
     """

@@ -21,8 +21,8 @@ from touchgoal.sim_envs.tactile.press import Press, solve3
 
 _ON_CONE = 0.99  # share of the friction limit that counts as slip
 _MAX_CORRECTION = 0.9  # share of a cell's normal force
-# What beyond friction's reach keeps the bristles' motion finite, as a share of their stiffness. The
-# force comes first: torsion gives way where the patch cannot bear both.
+# Keep the bristles' motion finite where friction cannot carry the load; shares of their stiffness.
+# Where the patch cannot carry both, torsion yields to force.
 _REGULARIZATION, _REGULARIZATION_TORSION = 1e-5, 1e-3
 _FORCE_TOLERANCE = 1e-4  # share of the friction limit
 _SQUARES = 24  # rows and columns of a picture's tractions
@@ -82,7 +82,7 @@ def _match_moments(normal, pitch, place, mx, my):
     if load == 0.0:
         return
     cx, cy = sx / load, sy / load
-    least = 1e-3 * load * pitch * pitch  # keeps lines, single cells from leaning endlessly
+    least = 1e-3 * load * pitch * pitch  # keeps the solution finite for lines and single cells
     vxx, vxy, vyy = sxx - cx * sx + least, sxy - cx * sy, syy - cy * sy + least
     determinant = vxx * vyy - vxy * vxy
     a = (vyy * (mx - sx) - vxy * (my - sy)) / determinant
@@ -117,7 +117,7 @@ def _bristles(normal, before, pitch, place, friction):
                 x = (j - 0.5 * (columns - 1)) * pitch + place[0]
                 y = (i - 0.5 * (rows - 1)) * pitch + place[1]
                 limit = friction * p
-                # Less pressure holds less: the traction of before, cut to today's cone.
+                # The earlier traction, cut to the present friction cone.
                 size = math.sqrt(before[0, i, j] ** 2 + before[1, i, j] ** 2)
                 share = limit / max(size, limit)
                 found[0, n], found[1, n] = x, y
@@ -135,7 +135,7 @@ def _bristles(normal, before, pitch, place, friction):
     return found, cx, cy, load
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")  # a check for zero is no vector code
+@njit(cache=True, fastmath=True, error_model="numpy")  # checks for zero prevent vectorisation
 @no_type_check
 def _brush_sums(bristles, stiffness, ux, uy, turn, total):
     """Sum force, torsion, and their derivatives, of bristles with moved tips."""
@@ -214,7 +214,7 @@ def _brush(normal, before, pitch, place, friction, stiffness, force, torque, out
     ux, uy, turn = _balance(bristles, stiffness, pitch * pitch, force[0], force[1], torsion)
     carried = np.empty(9)
     _brush_sums(bristles, stiffness, ux, uy, turn, carried)
-    # What is left over, be it beyond friction's reach, goes where the pressure is.
+    # The remaining force and torsion, even beyond friction, are spread in proportion to pressure.
     x, y, limit = bristles[0], bristles[1], bristles[4]
     polar = (limit * (x * x + y * y)).sum() / friction
     left_x, left_y = (force[0] - carried[0]) / load, (force[1] - carried[1]) / load
@@ -248,9 +248,8 @@ def force_field(
     """Spread the solver's wrench on a pad over the gel's cells; each is 2 x 2 of the pressure's.
 
     Force and torsion are met exactly, the moments about x and y as far as the patch reaches. Where
-    MuJoCo's friction against torsion bears more than the patch can, all cells slip, and what is
-    missing
-    is added in proportion to their pressure.
+    MuJoCo's torsional friction carries more than the patch can, all cells slip, and the missing
+    torsion is added in proportion to their pressure.
 
     Args:
         press: how the object sits in the gel, with an even number of pressure cells each way.

@@ -35,8 +35,8 @@ class Grid:
 
 
 # The kernels below are branchless so that the compiler vectorises them over a row: a missed ray
-# gets the distance _FAR. A ray's origin o is its point beside the object's centre, in the object's
-# frame, where the direction d is constant and the origins move linearly over the image.
+# gets the distance _FAR. In the object's frame all rays have the same direction d. A ray's origin o
+# is its point nearest to the object's centre, which moves linearly over the image.
 _FAR = np.float32(1.0)
 _TINY = np.float32(1e-9)
 
@@ -128,7 +128,7 @@ def _add_primitive(out, pitch, kind, position, rotation, size, bound):
     across = np.float32(1.0) / max(d[0] * d[0] + d[1] * d[1], _TINY)
     near_end = -size[1] if d[2] > 0 else size[1]
     z = position[2]
-    # A table, for converting the loop's counter would keep it from being vectorised.
+    # A table, because converting the loop's counter would prevent vectorisation.
     along = np.arange(columns).astype(np.float32)
     ex, ey, ez = rotation[0, 0] * pitch, rotation[0, 1] * pitch, rotation[0, 2] * pitch
     for i in range(top, bottom):
@@ -203,7 +203,7 @@ def _add_mesh(out, pitch, vertices, faces, position, rotation):
         y = rotation[1, 0] * vx + rotation[1, 1] * vy + rotation[1, 2] * vz + position[1]
         z = rotation[2, 0] * vx + rotation[2, 1] * vy + rotation[2, 2] * vz + position[2]
         px[i], py[i], height[i] = x * scale + x0, y * scale + y0, -z
-    margin = np.float32(1e-3)  # of a pixel: neighbours share their edge, no crack stays
+    margin = np.float32(1e-3)  # px: neighbouring triangles overlap, which closes cracks
     for f in range(len(faces)):
         a, b, c = faces[f]
         abx, aby, acx, acy = px[b] - px[a], py[b] - py[a], px[c] - px[a], py[c] - py[a]

@@ -12,9 +12,10 @@ from touchgoal.sim_envs.tactile.forces import ForceField
 from touchgoal.sim_envs.tactile.geometry import Grid
 
 DARKNESS = 0.7  # share of the light taken, a guess: print on a lit gel is not black
-# Friction holds the gel under an object. Of the spread without friction, a stuck ball leaves 10 %
-# in the middle, 60 % at its rim and 80 % outside (the layer solved in steps of a growing contact,
-# ball radius 5 to 25 mm, 1 to 15 N): a share that falls with the pressure on the spot.
+# Friction holds the gel under an object. Under a stuck ball the gel spreads by 10 % of the
+# frictionless amount in the middle, 60 % at the rim and 80 % outside: the share falls with the
+# local pressure. (The layer solved in steps of a growing contact, ball radius 5 to 25 mm, 1 to 15
+# N.)
 _FREE = 0.8
 
 
@@ -49,7 +50,8 @@ def layer_compliance(
     """
     t, shear = sensor.gel_thickness, sensor.shear_modulus
     k = np.maximum(k, 1e-3)
-    depth = np.minimum(k * t, 40.0)  # deeper is as good as endless, and cosh would overflow
+    # a deeper layer is as good as infinite, and cosh would overflow
+    depth = np.minimum(k * t, 40.0)
     ground = np.cosh(2 * depth) + 1 + 2 * depth**2
     along = (np.sinh(2 * depth) + 2 * depth) / (2 * shear * k * ground)
     return along, np.tanh(depth) / (shear * k), t * t / (shear * ground)
@@ -58,7 +60,7 @@ def layer_compliance(
 def _responses(
     sensor: SensorModel, step: float, size: float, offset: Float[np.ndarray, "n m 2"]
 ) -> Float32[np.ndarray, "5 n m"]:
-    """Displacements (m) per N on a square of `size` m, averaged over one at an offset."""
+    """Return displacements (m) per N on a square of `size` m, averaged over one at an offset."""
     n = 1 << int(np.ceil(np.log2(2.2 * max(sensor.gel_size) / step)))
     k = 2 * np.pi * np.fft.fftfreq(n, step)
     kx, ky = k[None], k[:, None]
@@ -175,7 +177,7 @@ def _draw(image, columns, centres, radius, darkness):
             row, column = image[i, left:right], columns[left:right]
             for k in range(row.size):
                 dx = column[k] - x
-                # Distance to the rim without a root: exact there to first order.
+                # Distance to the rim without a square root: exact to first order at the rim.
                 inside = half + scale * (room - dx * dx)
                 passed = one - darkness * min(max(inside, zero), one)
                 row[k] = np.uint8(np.float32(row[k]) * passed + half)

@@ -17,9 +17,9 @@ from touchgoal.sim_envs.tactile.geometry import NO_SURFACE, HeightField
 
 MAX_TILT = math.radians(3.0)
 MAX_OVERLAP = 0.02  # m; beyond any gripper's force
-# Nm/rad with which what holds the object resists its tilting in the gel: about what a second gel
-# does. A flat face or a line tilts until the moments balance (3 to 9 Nm/rad of its own); a ball
-# (0.1 to 0.7), whose tilting would only shift its print, hardly does, and no vertex tips over.
+# Nm/rad with which the holder resists tilting of the object in the gel: about that of a second gel.
+# A flat face or a line (3 to 9 Nm/rad of its own) tilts until the moments balance. A ball (0.1 to
+# 0.7), whose tilt would only shift its print, hardly tilts, and a vertex does not tip over.
 TILT_STIFFNESS = 1.0
 _FIRST_OVERLAP = 3e-4  # m, where the search begins
 _CENTRE_TOLERANCE = 5e-6  # m
@@ -167,7 +167,7 @@ def _balance_press(height, xs, pitch, volume, mx, my, stiffness, limit):
         g0 = total[6] - volume
         g1 = total[7] - mx + stiffness * a
         g2 = total[8] - my + stiffness * b
-        # A slope at its limit that wants beyond stays there.
+        # A slope at its limit stays there if it would go beyond.
         free1 = not ((a >= limit and g1 < 0.0) or (a <= -limit and g1 > 0.0))
         free2 = not ((b >= limit and g2 < 0.0) or (b <= -limit and g2 > 0.0))
         g1, g2 = g1 * free1, g2 * free2
@@ -178,7 +178,7 @@ def _balance_press(height, xs, pitch, volume, mx, my, stiffness, limit):
         s0, s1, s2 = solve3(n, x, y, xx, xy, yy, -g0, -g1, -g2)
         start = g0 * s0 + g1 * s1 + g2 * s2
         step = min(1.0, _room(a, s1, limit), _room(b, s2, limit))
-        # Along a convex energy's descent the slope rises: a step that ends well uphill is too long.
+        # Line search on a convex energy: shorten a step that ends where the energy rises.
         for _ in range(12):
             t0, t1, t2 = min(shift + step * s0, most), a + step * s1, b + step * s2
             _overlap_sums(height, top, xs, pitch, t0, t1, t2, trial)
@@ -205,7 +205,7 @@ def _pressure(height, xs, pitch, shift, a, b, modulus, force, out):
             row[j] = stiffness * max(source[j] + base + slope * xs[j], zero)
             line += row[j]
         total += line
-    if total > 0.0:  # 1, unless the overlap is at its most or lost in rounding
+    if total > 0.0:  # the factor is 1, unless the overlap is at its maximum, or rounds to 0
         out *= np.float32(force / (total * pitch * pitch))
 
 
@@ -214,10 +214,9 @@ def press_until_balanced(
 ) -> Press:
     """Push an object into the gel, and tilt it, until the pressure balances the solver's force.
 
-    Pressure = modulus x overlap. MuJoCo's penetration is no such measure: it depends on solver
-    settings
-    and mass. The normal force is met exactly, its moments as far as the patch and `MAX_TILT` let
-    them.
+    Pressure = modulus x overlap. MuJoCo's penetration is not this overlap: it depends on solver
+    settings and mass. The normal force is met exactly, its moments as far as the patch and
+    `MAX_TILT` let them.
 
     Args:
         height: object height over the whole gel, m; all NO_SURFACE: nothing presses.

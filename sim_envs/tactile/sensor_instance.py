@@ -58,7 +58,7 @@ def sample_instance(
         typical,
         pixel_pitch=pitch,
         response=_turned(typical.response, np.radians(turns)) * channels[..., None],
-        # Light l is that of channel l: where its response turns, its shadows turn with it.
+        # Light l lights channel l: its shadows turn with its response.
         light_azimuths=tuple(float(a) for a in azimuths),
         shadow=typical.shadow * channels,
         blur_sigmas=blur_sigmas,

@@ -23,7 +23,7 @@ class ShearRelief:
         """Prepare for forces on the gel's cells, two by two of `gel`, and surfaces on `image`."""
         self._stiffness, self._pitch = sensor.shear_stiffness, 2 * gel.pitch
         self._image = image
-        size = 2.2 * max(sensor.gel_size)  # apart, or the transform would wrap around
+        size = 2.2 * max(sensor.gel_size)  # m, padded: the Fourier transform wraps around
         self._n = 1 << int(np.ceil(np.log2(size / self._pitch)))
         self._kx = 2 * np.pi * np.fft.rfftfreq(self._n, self._pitch)[None]
         self._ky = 2 * np.pi * np.fft.fftfreq(self._n, self._pitch)[:, None]

@@ -53,7 +53,7 @@ from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort, S
 from touchgoal.sim_envs.twin.ur.controller import UrController
 
 _HTTP = re.compile(r" HTTP/\d")  # end of a browser's first line
-# What orders make of a stream: attributes of `mjpeg.Stream`.
+# Faults of a stream by order: attributes of `mjpeg.Stream`.
 _STREAM_FAULTS = {"stall": "stalled", "repeat": "frozen", "lose": "lost"}
 _STREAM_FAULTS |= {"break": "broken", "halve": "halved"}
 _SWITCH = {"on": True, "off": False}
@@ -94,7 +94,7 @@ class ControlPort(Service):
         for client in self._listener.poll():
             for line in client.lines():
                 if _HTTP.search(line):
-                    client.close()  # a web page in a browser; what it sends after that is no order
+                    client.close()  # a web page in a browser: ignore the rest that it sends
                     break
                 token, _, order = line.partition(" ")
                 if not secrets.compare_digest(token.encode(), self._token.encode()):

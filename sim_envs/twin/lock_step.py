@@ -16,7 +16,7 @@ from touchgoal.sim_envs.twin.tcp_ports import ClientConnection
 
 _POLL_INTERVAL = 5e-3  # s between looks at the links while time stands and nothing comes
 _MOST_STEPS = 1000  # at a time
-_PATIENCE = 3.0  # s on the wall for what a holder says is on its way
+_PATIENCE = 3.0  # s of wall time to wait for messages that the holder announced
 
 
 class LockStep:

@@ -28,7 +28,7 @@ class Stream:
     lost: float = 0.0
     broken: float = 0.0
     halved: float = 0.0
-    # clients, count, sent: who watches; pictures published; pictures sent to the last who came
+    # clients, count, sent: number of viewers; pictures published; pictures sent to the last viewer
     clients: int = 0
     count: int = 0
     sent: int = 0

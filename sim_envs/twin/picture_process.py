@@ -19,8 +19,8 @@ from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
 from touchgoal.sim_envs.tactile.pad import TactilePad
 from touchgoal.sim_envs.twin.mjpeg import Stream, StreamServer
 
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that an image may depend on
-_CAMERA_NOISE = 1.5  # counts: by it a driver tells a still scene from a frozen camera
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # everything that an image depends on
+_CAMERA_NOISE = 1.5  # counts: lets a driver tell a still scene from a frozen camera
 _TACTILE = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
 
 Picture = UInt8[np.ndarray, "h w 3"]

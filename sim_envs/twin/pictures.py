@@ -14,9 +14,9 @@ from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.twin.picture_process import STATE, Fault, Moment, Scene
 from touchgoal.sim_envs.twin.tcp_ports import Service
 
-CAMERA_RATE = 25  # Hz, as fingertips: more than a policy looks
+CAMERA_RATE = 25  # Hz, as a fingertip's; more than a policy reads
 _START_TIMEOUT, _ANSWER_TIMEOUT, _END_TIMEOUT = 120.0, 60.0, 5.0  # s, on a machine however loaded
-_MOST_BEHIND = 2  # moments that wait to be taken, in real time; then some are left out
+_MOST_BEHIND = 2  # unanswered requests in real time, beyond which images are left out
 _PROGRAM = "from touchgoal.sim_envs.twin.picture_process import main; main()"
 
 
@@ -26,12 +26,12 @@ class Pictures(Service):
     def __init__(self, cell: SimulatedCell, host: str, port: int) -> None:
         """Start the process; raises OSError if it cannot serve there."""
         self._cell, self._host = cell, host
-        self.held = False  # whether a client lets time go on, and must get a picture first
-        # taken, left_out: pictures that were due and taken, or not taken for the process was behind
+        self.held = False  # whether a client holds the time, and waits for each picture
+        # taken, left_out: due pictures that were taken, or skipped because the process was behind
         self.taken = self.left_out = 0
         env = cell.env
         self.rates: dict[str, int] = {}  # Hz, simulated, by stream, such as tactile_left
-        if env.config.tactile:  # first, because later images are sent later
+        if env.config.tactile:  # fingertips first: images are sent in this order
             names = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
             self.rates |= dict.fromkeys(names, round(env.sensor.frame_rate))
         self.rates |= dict.fromkeys(env.config.cameras, CAMERA_RATE)

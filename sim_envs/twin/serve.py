@@ -124,12 +124,12 @@ class Twin:
         services = self._services
         services.append(load_cell := serial_ports.LoadCell(cell, folder / "load_cell"))
         ports = {"load_cell": load_cell.port}
-        force = cell.env.grasp_force  # with which the episode's object is to be held
+        force = cell.env.grasp_force  # N, grasp force of the episode
         hand = None
         if config.arm == "fr3":
             timeout = _LOCK_STEP_TIMEOUT if config.lock_step else _CLIENT_TIMEOUT
             services.append(hand := FrankaHand(cell, host))
-            # First, so that its client works while the others are served.
+            # First, so that the arm's client works while the others are served.
             services.insert(0, arm := FrankaArm(cell, host, timeout, hand.link))
             gripper = GripperSection("franka_hand", address=host, force=force)
         else:
@@ -197,7 +197,7 @@ class Twin:
             cameras=cameras,
             load_cell=LoadCellConfig(load_cell, serial_ports.NEWTONS_PER_COUNT, serial_ports.ZERO),
             safety=SafetySection(
-                # Objects are grasped 2 mm above the table, which a simulated one survives.
+                # Objects are grasped 2 mm above the table, which a simulated table survives.
                 fingertips_lower=(*limits.fingertips.lower[:2].tolist(), 0.0),
                 state_timeout=_LOCK_STEP_TIMEOUT if config.lock_step else None,
             ),

@@ -1,4 +1,4 @@
-"""What the twin's services are, and their TCP ports, polled between two physics steps."""
+"""Base class of the twin's services, and TCP ports that are polled between two physics steps."""
 
 import socket
 

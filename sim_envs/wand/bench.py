@@ -18,7 +18,7 @@ VIEWS = ("top", "side_left", "side_right", "wand")
 """Cameras: overhead, from both sides, and the point of view on the wand."""
 GREEN = (0.05, 0.62, 0.2)  # of the green screen
 _BENCH = "bench"
-_SHADOW = 512  # px; at 1024 a third of the time of a touch goes into shadows
+_SHADOW = 512  # px; with 1024, shadows take a third of a touch's time
 _LOOK = {
     "plain": mujoco.mjtBuiltin.mjBUILTIN_FLAT,
     "speckled": mujoco.mjtBuiltin.mjBUILTIN_FLAT,
@@ -196,7 +196,8 @@ def _mesh(spec: mujoco.MjSpec, mesh: Mesh) -> str:
             name=name,
             uservert=vertices.ravel().tolist(),
             userface=faces.ravel().tolist(),
-            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,  # thin walls enclose little
+            # a thin wall's volume is too small for MuJoCo
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
     return name
 

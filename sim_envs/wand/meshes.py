@@ -24,7 +24,7 @@ def lathe(profile: Float[np.ndarray, "k 2"], edge: float = FINE) -> Mesh:
     """Return a surface of revolution about z.
 
     Args:
-        profile: radius and z (m) along a path, smooth between the points; a hollow thing goes up
+        profile: radius and z (m) along a path, smooth between the points; a hollow object goes up
             outside and down inside. Both ends are closed to the axis.
         edge: of the facets, m.
     """

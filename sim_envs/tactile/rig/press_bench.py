@@ -82,5 +82,5 @@ def warm_up(bodies: list[Body], sensor: SensorModel) -> None:
     for body in bodies:
         bench = PressBench(body, sensor, instance)
         bench.place(np.zeros(3))
-        for _ in range(2):  # the second time the gel remembers the first
+        for _ in range(2):  # the second reading continues the first one's shear
             bench.sense(1.0, rng, shear=(0.1, 0.0))

@@ -99,7 +99,7 @@ class ArmState:
             fields["reflex_reason"][:] = fields["errors"]
         fields["robot_mode"][:] = RobotMode.MOVE if motion else mode
         fields["controller_mode"][:] = motion.controller if motion else OTHER
-        # On this side of the wire 0 is idle, and none, which goes with torque, is 5.
+        # A state counts generators from 1: 0 is idle, 5 is none (torque control).
         fields["motion_generator_mode"][:] = motion.generator + 1 if motion else 0
         fields["control_command_success_rate"][:] = success_rate if motion else 0.0
 

@@ -24,8 +24,8 @@ _MAX_LOST_PACKETS = 20  # packets in a row after which the arm stops: Franka's d
 _POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none
 _EXTERNAL = 2  # controller: torque; the others are the robot's own
 _SETTERS = {*range(RobotCommand.SET_COLLISION_BEHAVIOUR, RobotCommand.SET_LOAD + 1)}
-# s between states while time stands, to a client that does not drive the arm, whose motion begins,
-# that drives it (libfranka gives up after 1 s).
+# s between states while time stands, to a client without a motion, with a motion that begins, and
+# with one under way (libfranka gives up after 1 s).
 _HELD_INTERVALS = 0.005, 0.02, 0.2
 _BRAKING = FR3.hardware.acceleration  # rad/s^2 of braking; a real reflex brakes harder
 
@@ -98,7 +98,7 @@ class FrankaArm(Service):
 
     @property
     def obeys(self) -> bool:
-        """Whether the client's set-points arrive, or none are taken."""
+        """Whether the client's motion has begun, or the arm accepts none."""
         motion = self._motion
         return self.mode != RobotMode.IDLE or (motion is not None and motion.begun)
 

@@ -16,7 +16,7 @@ _STILL = 1e-3  # m/s of width
 _SETTLED = 0.1  # s without motion after which a move is over
 _SOMETHING = 1e-3  # m: narrower than this the fingers have met
 _STATE_INTERVAL = 20  # ms between states; a real hand takes 20 to 50
-_FIRST_STATE = 5  # ms: none is on its way when a lock-step client looks, every 50 ms
+_FIRST_STATE = 5  # ms: then no state is on its way when a lock-step client looks, every 50 ms
 _HELD_INTERVAL = 0.004  # s between states while time stands
 _GRASP_TOLERANCE = 2e-3  # m by which the width may change while something is held
 
@@ -38,7 +38,7 @@ class FrankaHand(Service):
     def __init__(self, cell: SimulatedCell, host: str) -> None:
         self.cell = cell
         self.link = messages.Link(host, messages.HAND_PORT, messages.HAND_VERSION, wide=False)
-        self.commands = self.answers = 0  # numbers of commands come, and of those answered
+        self.commands = self.answers = 0  # numbers of commands received and answered
         self._milliseconds = 0
         self._held_at = 0.0  # monotonic s, of the last state while time stands
         self._job: Job | None = None

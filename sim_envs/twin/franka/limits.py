@@ -67,7 +67,7 @@ _LIMITS = (
     "velocity_discontinuity",
     "acceleration_discontinuity",
 )
-_SPEED = 1  # place of the last of them that holds for set-points in Cartesian space
+_SPEED = 1  # index of the last limit that holds for Cartesian set-points
 
 
 @njit(cache=True)

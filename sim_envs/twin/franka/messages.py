@@ -16,7 +16,7 @@ import numpy as np
 ROBOT_PORT, HAND_PORT = 1337, 1338
 ROBOT_VERSION, HAND_VERSION = 10, 3
 _SEND_TIMEOUT = 0.5  # s that a client may take to read an answer
-_ABSURD = 1e6  # in any unit of an arm's settings
+_ABSURD = 1e6  # larger than any setting of an arm, in any unit
 _LONGEST = 4096  # bytes of a command; the longest of the protocol has 300
 
 
@@ -331,8 +331,8 @@ class Link:
             return n >= (expected or 0)
         if n != expected:
             return False
-        # The hand answers for itself what it cannot do; libfranka checks the arm's numbers.
-        # What no arm has (a tool a thousand metres long) would overflow the Jacobian.
+        # The hand itself refuses what it cannot do; libfranka checks the arm's numbers. Absurd
+        # values (a tool a thousand metres long) would overflow the Jacobian.
         return not self._wide or bool(
             (np.abs(np.frombuffer(request.payload, "<f8")) < _ABSURD).all()
         )

@@ -19,10 +19,10 @@ from touchgoal.sim_envs.twin.ur.messages import Package, Safety
 from touchgoal.sim_envs.twin.ur.program import UrProgram
 
 _CYCLE = 2  # ms, of a controller of the e-Series
-_SELDOM = 10  # ms between looks at what is not real-time
+_SELDOM = 10  # ms between polls of the dashboard and script ports
 _UNLOCK_DELAY = 5.0  # s after a protective stop before it can be unlocked
 _FORCE_LIMIT = 150.0  # N at the tool; the factory's safety presets run from 100 to 250
-_FASTEST = 500.0  # Hz of an e-Series' data; also rad/s that no joint comes near
+_FASTEST = 500.0  # Hz of an e-Series' data; also rad/s, above any joint's speed
 _MOST_RECIPES = 255
 _STOPPED, _PLAYING = 1, 2  # runtime_state
 _POWER_OFF, _IDLE, _RUNNING = 3, 5, 7  # robot_mode
@@ -79,7 +79,7 @@ class UrController(Service):
         if program.running and program.activity is not None:
             q, dq = program.activity.step(self.cell.q_d, self.cell.dq_d, self._speed_fraction)
             hardware = UR5E.hardware
-            # Nor may numbers that are none, from absurd speeds, reach the physics.
+            # Absurd speeds or NaN must not reach the physics either.
             if ((q >= hardware.lower) & (q <= hardware.upper) & (np.abs(dq) < _FASTEST)).all():
                 self.cell.set_target(q, dq)
             else:

@@ -22,7 +22,7 @@ _READY, _DONE = 1, 2
 _STREAMED = {6, 9, 10, 11, 12, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}
 _WITHOUT_EFFECT = {0, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, gains, a kick of the watchdog
 _UNANSWERED = {25, 66}  # toolContact, directTorque: clients do not read an answer
-_REFUSAL_CYCLES = 250  # 0.5 s at most; a client that waits for an answer has given up long before
+_REFUSAL_CYCLES = 250  # 0.5 s at most; a client that waits for an answer gives up much earlier
 _STOP_SCRIPT = 255
 _PACE = 1e-3, 40.0  # rad/s or m/s, and those per s: least and most that ur-rtde lets through
 
