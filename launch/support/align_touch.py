@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 def align_touch(config: "Align") -> None:
     """Align a touch encoder on episodes, touches of the wand or annotations; check them before."""
-
     check_training(config, config.out)
     if config.data.suffix != ".jsonl" and is_wand_set(config.data):
         _align_wand(config)
