@@ -167,3 +167,18 @@ def test_a_touch_encoder_is_aligned_on_the_wands_touches(wand: Path, tmp_path: P
     assert encoder.towers == "offline"
     picture = np.random.default_rng(0).integers(0, 255, (2, 240, 320, 3), dtype=np.uint8)
     np.testing.assert_allclose(np.linalg.norm(encoder.embed(picture), axis=1), 1, atol=1e-4)
+
+
+def test_touches_of_another_sensor_choose_among_sentences(
+    wand: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "episodes"
+    with pytest.MonkeyPatch.context() as patch, in_process_workers():
+        patch.setattr(wand_recording, "TOUCHES_A_VISIT", 3)
+        record_touches(other, "gelsight", 1, 18, 1)
+    command = f"benchmark zero-shot --data {other} --other {wand} --seeds 3 --heads.epochs 2"
+    command += f" --cache {wand.parent / 'cache'} --out {tmp_path / 'run'}"
+    assert main(command.split()) in (0, None)
+    assert "trained on gelsight_mini" in capsys.readouterr().out
+    row = json.loads((tmp_path / "run/metrics.json").read_text())["rows"][0]
+    assert row["seen top-1"][0] <= row["seen top-5"][0]

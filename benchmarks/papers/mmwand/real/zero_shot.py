@@ -1,5 +1,7 @@
 """Materials of real objects by sentences, never trained on: MMWand's Table III, on ObjectFolder Real.
 
+With --other: the same table on touches of the wand, see `other_set`.
+
 A touch gets the material whose sentences are nearest on average. The gel's untouched picture is
 the median of all touches, because none is published.
 """
@@ -12,6 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.benchmarks.options import BenchmarkOptions
+from touchgoal.benchmarks.papers.mmwand.other_set import run_other_set
+from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
@@ -19,7 +23,7 @@ from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
     read_touches,
 )
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.option_types import checked_dataclass
+from touchgoal.runtime.option_types import Count, checked_dataclass
 
 SENTENCES = {
     "ceramic": ("hard, smooth glazed ceramic", "a smooth and hard object like porcelain"),
@@ -39,13 +43,26 @@ class Config(BenchmarkOptions):
     """Options of benchmark zero-shot."""
 
     data: Path = field(kw_only=True)
-    """Folder of ObjectFolder Real, with objects.csv and touch/."""
+    """Folder of ObjectFolder Real, with objects.csv and touch/; or touches of the wand recorded with
+    another sensor than those of --other."""
+    other: Path | None = None
+    """Touches of the wand to train on as well: who trains on one sensor is judged on the other."""
     encoders: tuple[str, ...] = ("gelsight_mini",)
-    """Touch encoders with words: names or folders."""
+    """Touch encoders: names or folders. On ObjectFolder Real they need words of their own; on touches
+    of the wand heads are trained."""
+    seeds: Count = 3
+    """Divisions of the wand's objects into seen and unseen ones."""
+    heads: HeadsConfig = HeadsConfig()
+    """Training of the heads on touches of the wand."""
+    cache: Path = Path("runs/mmwand-embeddings")
+    """Folder that keeps the embeddings of the wand's touches."""
 
 
 def run(config: Config) -> dict[str, Any]:
     """Name the material of every labelled object."""
+    if config.other is not None:
+        rest = config.heads, config.seeds, config.cache
+        return run_other_set(config.data, config.other, config.encoders, *rest)
     objects = read_objectfolder_real(config.data)
     touches, untouched = read_touches(objects)
     labelled = [i for i, item in enumerate(objects) if item.material is not None]
