@@ -28,7 +28,7 @@ class Config:
     or a folder of several of them."""
     goal: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Goal to measure the distance to; may be given several times. Default: last; where failures are
-    among the episodes, the end of another success with the same object."""
+    among the episodes, the nearest end of the other successes with the same object."""
     index: tuple[int, ...] = ()
     """Episodes of the set to measure, counted from 0. Default: all."""
     camera: str = "front"
@@ -60,7 +60,7 @@ class Config:
 def main(config: Config) -> None:
     """Check, measure what is not measured yet, and write the reports."""
     from touchgoal.rewards.default_goal import goals_of
-    from touchgoal.rewards.goals import EpisodeEnd, OwnFrame, assign_goals, parse_goal
+    from touchgoal.rewards.goals import Bank, OwnFrame, assign_goals, parse_goal
     from touchgoal.rewards.measure import Measurement, write_skipped
     from touchgoal.rewards.report.frame_table import FRAMES
     from touchgoal.rewards.report.page import PAGE
@@ -77,8 +77,8 @@ def main(config: Config) -> None:
         print(source.summary)
     given = [parse_goal(text) for text in config.goal]
     goals = {} if given else goals_of(source.trajectories)
-    if any(isinstance(goal, EpisodeEnd) for goal in goals.values()):
-        print("failures are among the episodes: the goal is the end of another success, not last")
+    if any(isinstance(goal, Bank) for goal in goals.values()):
+        print("failures are among the episodes: the goal is the nearest end of other successes")
     elif OwnFrame() in given and any(t.meta.get("success") is False for t in source.trajectories):
         print("failures are among the trajectories, and to last each of them ends at cost 0, too")
     first = given or list(goals.values())[:1]

@@ -6,7 +6,7 @@ With `last`, every failure would end at a cost of 0.
 from collections.abc import Mapping, Sequence
 
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.rewards.goals import EpisodeEnd, GoalSpec, OwnFrame
+from touchgoal.rewards.goals import Bank, GoalSpec, OwnFrame
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
@@ -15,8 +15,8 @@ from touchgoal.runtime.errors import UserError
 def goals_of(trajectories: Sequence[Trajectory]) -> dict[str, GoalSpec]:
     """Return the goal of each trajectory by name, where the user gave none.
 
-    That is its own last frame; if one of them failed, the end of the first other success of the set
-    with the same object. The only success with an object keeps its own end. UserError: a failure
+    That is its own last frame; if one of them failed, the nearest end of the other successes of the
+    set with the same object. The only success with an object keeps its own end. UserError: a failure
     among videos, or an object without a success.
     """
     failed = [t for t in trajectories if t.meta.get("success") is False]
@@ -29,7 +29,7 @@ def goals_of(trajectories: Sequence[Trajectory]) -> dict[str, GoalSpec]:
             "end of a success, --goal image:FILE or --goal episode:SET#K"
         )
     successes = _successes(episodes[0].episodes)
-    return {t.name: _end_of_success(t, successes) for t in episodes}
+    return {t.name: _successful_ends(t, successes) for t in episodes}
 
 
 def _successes(episodes: EpisodeSet) -> dict[str, list[int]]:
@@ -42,12 +42,11 @@ def _successes(episodes: EpisodeSet) -> dict[str, list[int]]:
     return found
 
 
-def _end_of_success(trajectory: EpisodeTrajectory, successes: Mapping[str, list[int]]) -> GoalSpec:
+def _successful_ends(trajectory: EpisodeTrajectory, successes: Mapping[str, list[int]]) -> GoalSpec:
     root, what = trajectory.episodes.root, str(trajectory.meta.get("object", ""))
     same_object = successes.get(what, [])
-    others = [i for i in same_object if i != trajectory.index]
-    if others:
-        return EpisodeEnd(root, others[0])
+    if set(same_object) - {trajectory.index}:
+        return Bank(root)
     if same_object:
         return OwnFrame()
     raise UserError(

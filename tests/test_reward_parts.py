@@ -205,11 +205,17 @@ def test_ends_are_a_goal_that_is_saved_and_chosen_by_object(
     others = [replace(e, object="pear") for e in successes[:2]]
     SuccessfulEnds.of([*successes, *others]).save(tmp_path / "goal.npz")
     ends = SuccessfulEnds.load(tmp_path / "goal.npz")
-    assert len(ends.frames) == 8 and len(ends.of_object("pear", "goal")) == 2
-    assert len(ends.of_object("", "goal")) == 8
+
+    def chosen(own: EmbeddedEpisode) -> EmbeddedEpisode:
+        return ends.for_trajectory(own, "goal")
+
+    other = embedded(9)
+    assert len(ends.frames) == 8 and len(chosen(replace(other, object="pear"))) == 2
+    assert len(chosen(replace(other, object=""))) == 8
+    assert len(chosen(other)) == 6 and len(chosen(successes[0])) == 5, "its own end is left out"
     with pytest.raises(UserError, match="no end with plum, only with apple, pear"):
-        ends.of_object("plum", "goal")
-    mine = part_distances(embedded(9), goal_at_every_frame(ends.of_object("apple", "goal")))
+        chosen(replace(other, object="plum"))
+    mine = part_distances(embedded(9), goal_at_every_frame(chosen(other)))
     last = [
         part_distances(embedded(9), goal_at_every_frame(e.take(slice(-1, None)))) for e in successes
     ]

@@ -209,7 +209,7 @@ class EpisodeEmbedder:
             cameras = {main: self.embed_camera(spec.read())}
             return {"image": cameras[main].pooled, "cameras": cameras}
         if isinstance(spec, Bank | GoalFile):
-            end = self._successful_ends(spec, own).of_object(own.object, str(spec))
+            end = self._successful_ends(spec, own).for_trajectory(own, str(spec))
             return {"image": end.image, "cameras": end.cameras}
         if isinstance(spec, EpisodeEnd):
             frames = spec.read(tuple(own.cameras) or (main,)).frames
@@ -223,7 +223,7 @@ class EpisodeEmbedder:
         if isinstance(spec, OwnFrame):
             end = own.take(_one(frame_index(spec, len(own), own.source)))
         elif isinstance(spec, Bank | GoalFile):
-            end = self._successful_ends(spec, own).of_object(own.object, str(spec))
+            end = self._successful_ends(spec, own).for_trajectory(own, str(spec))
         elif isinstance(spec, EpisodeEnd):
             read = spec.read(own.sides)
             end = self.embed_episode(replace(read, meta={}), own.fps, str(spec))

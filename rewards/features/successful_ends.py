@@ -7,6 +7,7 @@ from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
+from jaxtyping import Bool
 
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
@@ -16,6 +17,7 @@ from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 
 GOAL_FILE = "goal.npz"
+_EQUAL = 1e-4  # largest difference between embeddings of the same frame in other batches
 _REMEDY = "write one with touchgoal fit-normalizer"
 
 
@@ -32,21 +34,34 @@ class SuccessfulEnds:
         ends = [episode.take(slice(len(episode) - 1, None)) for episode in episodes]
         return cls(ends[0].extended(ends[1:]), tuple(episode.object for episode in episodes))
 
-    def of_object(self, name: str, what: str) -> EmbeddedEpisode:
-        """Return the ends with an object, all if objects are unknown here or there.
+    def for_trajectory(self, own: EmbeddedEpisode, what: str) -> EmbeddedEpisode:
+        """Return the ends with the trajectory's object, all if objects are unknown here or there.
 
-        UserError, which names the goal as `what`: the object is not among those known.
+        The trajectory's own end is left out: it would cost 0 whatever happened. UserError, which names
+        the goal as `what`: no end is left.
         """
         known = sorted(set(self.objects) - {""})
-        if not name or not known:
-            return self.frames
-        rows = np.flatnonzero([one == name for one in self.objects])
+        fits = np.ones(len(self.objects), bool)
+        if own.object and known:
+            fits = np.array([one == own.object for one in self.objects])
+            if not fits.any():
+                raise UserError(
+                    f"goal '{what}' has no end with {own.object}, only with {', '.join(known)}: add "
+                    "a success with it"
+                )
+        rows = np.flatnonzero(fits & ~self._ends_of(own))
         if not len(rows):
-            raise UserError(
-                f"goal '{what}' has no end with {name}, only with {', '.join(known)}: add a "
-                "success with it"
-            )
+            raise UserError(f"goal '{what}' holds the end of {own.source} alone: add a success")
         return self.frames.take(rows)
+
+    def _ends_of(self, own: EmbeddedEpisode) -> Bool[np.ndarray, " ends"]:
+        """Return which ends are the last frame of a trajectory."""
+        pairs = []
+        if own.image is not None and self.frames.image is not None:
+            pairs.append((self.frames.image, own.image[-1]))
+        if own.touch is not None and self.frames.touch is not None:
+            pairs += list(zip(self.frames.touch, own.touch[:, -1], strict=True))
+        return np.all([np.abs(ends - last).max(1) < _EQUAL for ends, last in pairs], axis=0)
 
     def save(self, path: Path) -> None:
         """Write a compressed npz file, atomically."""

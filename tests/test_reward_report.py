@@ -1,0 +1,257 @@
+"""Measuring any data: videos by their names, skipped and resumed trajectories, tables and pages."""
+
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from test_episode_embedder import PaintTowers, recorded
+
+from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
+from touchgoal.episodes.media import write_video
+from touchgoal.episodes.store import EpisodeWriter
+from touchgoal.rewards.curves import Contact, Curves
+from touchgoal.rewards.default_goal import goals_of
+from touchgoal.rewards.features.embedder import EpisodeEmbedder
+from touchgoal.rewards.goals import Bank, Goal, OwnFrame
+from touchgoal.rewards.measure import Measurement, write_skipped
+from touchgoal.rewards.report.outcome_table import outcome_table
+from touchgoal.rewards.report.page import write_pages
+from touchgoal.rewards.report.record import Facts, Record, load_facts
+from touchgoal.rewards.report.report import report_all
+from touchgoal.rewards.reward_model import RewardModel
+from touchgoal.rewards.sources import trajectory
+from touchgoal.rewards.sources.open_source import open_source
+from touchgoal.runtime.errors import UserError
+
+EPISODE = recorded()
+MODEL = RewardModel(EpisodeEmbedder(PaintTowers(), None), Goal(image=OwnFrame()), None, "raw")
+
+
+@pytest.fixture
+def episodes(tmp_path: Path) -> Path:
+    """Three successes and a failure with cups, the last success alone with a can."""
+    writer = EpisodeWriter(tmp_path / "set")
+    for success, what in ((True, "cup"), (True, "cup"), (False, "cup"), (True, "can")):
+        meta = {"success": success, "object": what, "outcome": "success" if success else "drop"}
+        writer.append(replace(EPISODE, meta=meta))
+    return tmp_path / "set"
+
+
+def measure(source: Path, out: Path) -> Measurement:
+    trajectories = open_source(source, "front", with_touch=False).trajectories
+    measurement = Measurement(trajectories, lambda _: MODEL, out, gamma=1.0, plots=1)
+    measurement.run(workers=2)
+    report_all(measurement.records, out, MODEL.provenance())
+    return measurement
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_an_interrupted_measurement_goes_on_to_the_same_files(
+    episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measure(episodes, tmp_path / "whole")
+    chunks, begun = MODEL.embedder.embed_chunks, []
+
+    def interrupted(*arguments: Any, **options: Any) -> Any:
+        begun.append(arguments)
+        if len(begun) == 3:
+            raise KeyboardInterrupt
+        return chunks(*arguments, **options)
+
+    monkeypatch.setattr(MODEL.embedder, "embed_chunks", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        measure(episodes, tmp_path / "resumed")
+    assert len(list((tmp_path / "resumed" / "measured").iterdir())) == 2
+    measure(episodes, tmp_path / "resumed")
+    assert len(begun) == 5, "what was measured is not measured again"
+    whole = contents(tmp_path / "whole")
+    assert contents(tmp_path / "resumed") == whole
+    assert {"episode_000.png", "episode_003.csv", "frames.parquet", "report.html"} <= whole.keys()
+    assert "episode_001.png" not in whole
+
+
+def test_videos_are_found_by_what_their_names_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """NAME.mp4 with others beside it, folders with front.mp4, and one that is broken."""
+    folder = tmp_path / "lab"
+    front, touch = EPISODE.frames[FRONT], EPISODE.frames[TACTILE_LEFT]
+    for name in ("a2", "a10"):
+        write_video(folder / f"{name}.mp4", front, 25)
+        write_video(folder / f"{name}_tactile_left.mp4", touch, 25)
+    for role in ("front", "tactile_left"):
+        write_video(folder / "b" / f"{role}.mp4", front if role == "front" else touch, 25)
+    write_video(folder / "c.mp4", front, 25)
+    write_video(folder / "c_tactile_left.mp4", touch[:9], 25)
+    (folder / "d.mp4").write_bytes(b"no video")
+    (folder / "labels.csv").write_text("file,outcome,object\na2.mp4,success,cup\na10.mp4,slip,\n")
+    monkeypatch.setattr(trajectory, "_CHUNK_BYTES", 1)  # chunks of 16 frames at most
+    source = open_source(folder, "front")
+    assert [t.name for t in source.trajectories] == ["a2", "a10", "b"]
+    assert [t.offset for t in source.trajectories] == [0, 12, 24]
+    assert dict(source.trajectories[1].meta) == {"outcome": "slip", "success": False}
+    assert source.inputs.sides == (TACTILE_LEFT,) and source.inputs.camera == FRONT
+    [unequal, broken] = source.skipped
+    assert "9 frames" in unequal.reason and "no readable video" in broken.reason
+    [chunk] = source.trajectories[2].chunks()
+    assert set(chunk.frames) == {FRONT, TACTILE_LEFT} and chunk.frames[FRONT].shape == front.shape
+    one = open_source(folder / "a2.mp4", "wrist").inputs
+    assert (one.camera, one.sides) == (WRIST, (TACTILE_LEFT,))
+    assert open_source(folder / "b", "front", with_touch=False).inputs.sides == ()
+    line = write_skipped(source.skipped, 5, tmp_path)
+    assert line.startswith("2 of 5 skipped") and "c," in (tmp_path / "skipped.csv").read_text()
+
+
+def test_no_failure_is_measured_to_its_own_end(episodes: Path, tmp_path: Path) -> None:
+    source = open_source(episodes, "front")
+    goals = goals_of(source.trajectories)
+    assert goals == {
+        "episode_000": Bank(episodes),
+        "episode_001": Bank(episodes),
+        "episode_002": Bank(episodes),
+        "episode_003": OwnFrame(),  # the only success with its object
+    }
+    assert set(goals_of(source.trajectories[:2]).values()) == {OwnFrame()}
+    write_video(tmp_path / "x.mp4", EPISODE.frames[FRONT], 25)
+    (tmp_path / "labels.csv").write_text("file,outcome\nx.mp4,drop\n")
+    with pytest.raises(UserError, match="x failed, and .* --goal image:FILE"):
+        goals_of(open_source(tmp_path / "x.mp4", "front").trajectories)
+
+
+def facts(success: bool, end: float, own_goal: bool = False) -> Facts:
+    fall = np.linspace(1, end, 12)
+    curves = Curves("a", {}, 20.0, Contact(None, "no touch"), {"image": fall}, {"image": fall})
+    measured = {name: m.as_dict() for name, m in curves.metrics().items()}
+    outcome = "success" if success else "drop"
+    return Facts("a", "a", 0, 0, 12, 20.0, "cost", True, {}, own_goal, None, "no touch", "",
+                 outcome, success, measured, {}, [], [])  # fmt: skip
+
+
+def test_outcomes_are_compared_by_goals_of_others_alone() -> None:
+    some = [facts(True, 0.1), facts(True, 0.3), facts(False, 0.2), facts(False, 0.9)]
+    table = outcome_table([*some, facts(True, 0.0, own_goal=True)])
+    row = next(line.split() for line in table.splitlines() if line.startswith("image"))
+    assert row[1:] == ["0.20", "0.55", "0.75"]
+    assert "none: every goal" in outcome_table([facts(False, 0.0, own_goal=True)])
+
+
+def test_tables_for_lerobot(episodes: Path, tmp_path: Path) -> None:
+    record = Record.load(measure(episodes, tmp_path).records[1])
+    table = pq.read_table(tmp_path / "frames.parquet")
+    assert table.num_rows == 48 and table["index"].to_pylist() == list(range(48))
+    second = table.slice(12, 12)
+    assert set(second["episode_index"].to_pylist()) == {1}
+    assert second["cost_image"].to_pylist() == pytest.approx(record.costs["image"], abs=1e-6)
+    step = record.columns["potential_reward_image"]
+    assert second["next.reward"].to_pylist() == pytest.approx([*step[1:], 0], abs=1e-6)
+    about = {
+        k.decode().removeprefix("lerobot.reward_scoring."): json.loads(v)
+        for k, v in table.schema.metadata.items()
+        if k.startswith(b"lerobot.")
+    }
+    assert (about["format"], about["schema_version"]) == ("lerobot.frame_signals", 1)
+    signals = set(table.column_names) - {"index", "episode_index", "frame_index"}
+    assert about["descriptors"].keys() == signals and about["episode_indices"] == [0, 1, 2, 3]
+    assert about["descriptors"]["cost_image"]["direction"] == "lower"
+    assert not (tmp_path / "touchgoal_progress.parquet").exists(), "raw distances are no progress"
+
+
+class Page(HTMLParser):
+    """Open tags and addresses of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in ("meta", "input"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def data_of(page: Path) -> dict[str, Any]:
+    text = page.read_text()
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
+    assert found and Page(text).open == []
+    return json.loads(found[1])
+
+
+@pytest.fixture
+def pages(episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    measurement = measure(episodes, tmp_path / "out")
+
+    def write(on_a_page: int) -> Path:
+        monkeypatch.setattr("touchgoal.rewards.report.page.ON_A_PAGE", on_a_page)
+        all_facts = [load_facts(path) for path in measurement.records]
+        return write_pages(measurement.records, all_facts, tmp_path / "out", ["title\n<b>"])
+
+    return write
+
+
+def test_page_holds_everything(pages: Callable[..., Path]) -> None:
+    page = pages(100)
+    data = data_of(page)
+    assert Page(page.read_text()).addresses == [] and "&lt;b&gt;" in page.read_text()
+    assert [e["outcome"] for e in data["episodes"]] == ["success", "success", "drop", "success"]
+    first = data["episodes"][0]
+    assert len(first["curves"]["image"]) == 12 and first["shown"] == list(range(12))
+    sheet = first["sheets"]["front"]
+    assert (sheet["columns"], sheet["width"], sheet["height"]) == (8, 96, 96)
+    index = pages(3)
+    assert Page(index.read_text()).addresses == [
+        "report.html",
+        "report_001.html",
+        "report_002.html",
+    ]
+    assert "curves" not in data_of(index)["episodes"][0]
+    assert data_of(index)["episodes"][3]["page"] == "report_002.html#episode_003"
+    assert len(data_of(index.with_name("report_002.html"))["episodes"]) == 1
+
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+ACTIONS = """
+<script>
+const key = (name) => document.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));
+key("ArrowLeft");
+const scrubbed = byId("time").textContent;
+key("ArrowDown");
+[...document.querySelectorAll("th")].find((cell) => cell.textContent === "outcome").click();
+const rows = [...byId("table").tBodies[0].rows].map((row) => row.dataset.name);
+document.title = JSON.stringify({scrubbed, chosen: byId("name").textContent, rows,
+  paths: document.querySelectorAll("#chart path").length});
+</script>
+"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on the path")
+def test_page_in_a_browser(pages: Callable[..., Path], tmp_path: Path) -> None:
+    page = pages(100)
+    acted = tmp_path / "acted.html"
+    acted.write_text(page.read_text().replace("</body>", f"{ACTIONS}</body>"))
+    command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+    profile = f"--user-data-dir={tmp_path / 'profile'}"
+    done = subprocess.run(
+        [*command, profile, acted.as_uri()], capture_output=True, text=True, timeout=120
+    )
+    found = re.search(r"<title>(.*?)</title>", done.stdout)
+    assert found, done.stderr
+    result = json.loads(found[1].replace("&quot;", '"'))
+    assert result["scrubbed"].endswith("frame 10") and result["chosen"] == "set#1"
+    assert result["rows"][0] == "episode_002" and result["paths"] >= 1
