@@ -16,9 +16,9 @@ STRIDES = {"pair": 5, "clip": 2}
 
 
 def find_published(name: str | Path) -> Path | None:
-    """Return the file of published weights, fetched if need be; None if the name means no such.
+    """Return the file of published weights, fetched if needed; None if `name` is something else.
 
-    It is named by a file, a folder or a Hugging Face id. UserError: several files, or an id that
+    `name` is a file, a folder or a Hugging Face id. UserError: several files, or an id that
     cannot be fetched.
     """
     path = Path(name)

@@ -83,7 +83,7 @@ def _draw_panel(
 
 
 def _up_to(panel: np.ndarray, box: BboxBase, share: float) -> np.ndarray:
-    """Return the panel with the future faded and a line at the present, a share of the time axis."""
+    """Return the panel with a line at the present (share of the time axis) and a faded future."""
     shown = panel.copy()
     column = round(box.x0 + share * (box.x1 - box.x0))
     top, bottom = len(panel) - round(box.y1), len(panel) - round(box.y0) - 2

@@ -8,7 +8,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
-_SHARED_FRACTION = 0.1  # above it they are copies; simulated ones may begin with the same frames
+_SHARED_FRACTION = 0.1  # least share in copies; simulated episodes may begin alike
 NamedChecksums = tuple[str, frozenset[int]]
 """A recording's name for messages, and the checksums of all its frames."""
 

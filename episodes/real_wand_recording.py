@@ -65,14 +65,14 @@ def record_real_touches(
 
 
 class _Session:
-    """One visit: devices into the recorder, touches into the set, hints onto the terminal."""
+    """One visit: feeds the recorder, writes its touches to the set, prints its hints."""
 
     def __init__(
         self, writer: EpisodeWriter, visit: Visit, recorder: WandRecorder, wand: Wand
     ) -> None:
         self._writer, self._visit, self._recorder, self._wand = writer, visit, recorder, wand
         self._line = _StatusLine()
-        self._worn = ""  # kind of wear that was said last
+        self._worn = ""  # kind of wear that was last printed
 
     def run(self, stopped: Callable[[], bool], count: int | None) -> None:
         """Record until there are `count` touches of this object, a device is lost, or Ctrl-C."""
@@ -103,7 +103,7 @@ class _Session:
         self._line.say(f"recorded {sum(self._recorder.counts)}: {touch.load[-1]:.1f} N")
 
     def _warn(self) -> None:
-        """Say once what the gel looks like."""
+        """Print the gel's wear, once for each kind."""
         wear = self._recorder.wear
         kind = wear.kind if wear else ""
         if kind and kind != self._worn:
@@ -112,7 +112,7 @@ class _Session:
 
 
 class _StatusLine:
-    """One line that is written anew on a terminal; in a pipe each new hint is a line."""
+    """A line that is overwritten on a terminal; in a pipe each new hint is a line."""
 
     def __init__(self) -> None:
         self._terminal, self._shown = sys.stdout.isatty(), ""

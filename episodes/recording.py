@@ -48,8 +48,8 @@ class EpisodeSpec:
 CORRECTED = "corrected"
 """Outcome of an episode in which a policy acted while an expert's actions were recorded."""
 Roles = Callable[[Any, EpisodeSpec], tuple[Actor, Actor]]
-"""Returns for an environment after its reset the actor, and the expert whose actions are recorded; both
-are one object where the expert acts itself."""
+"""Return the actor, and the expert whose actions are recorded, for an environment after its reset; one
+object twice if the expert itself acts."""
 
 
 class NoSuccessError(UserError):
@@ -83,7 +83,7 @@ def episode_specs(
 def episode_spec(
     seed: int, outcome: Outcome, options: dict[str, Any], among: Sequence[str] = tuple(CATALOGUE)
 ) -> EpisodeSpec:
-    """Return a spec; for outcome same_shape another object `among` these lies on the table."""
+    """Return a spec; for outcome same_shape the object on the table is another one of `among`."""
     if outcome != "same_shape":
         return EpisodeSpec(seed, outcome, options)
     asked = options["object"]
@@ -152,7 +152,7 @@ def record_with_film(
 ) -> tuple[Episode, UInt8[np.ndarray, "n h w 3"]]:
     """Record and film an episode, tick by tick; the images are for `episodes.film.write_film`.
 
-    Without a maker of the actor, which gets the environment after its reset, the expert acts.
+    `policy` makes the actor for the environment after its reset; without it the expert acts.
     """
     observation, info = env.reset(seed=spec.seed, options=spec.options)
     actor = policy(env) if policy else make_expert(env, spec.outcome)
@@ -186,7 +186,7 @@ def to_episode(
 
 
 def _outcome(asked: Outcome, frames: dict[str, np.ndarray], success: bool) -> str:
-    """Return the outcome that was asked for, or a name that says that it did not come about."""
+    """Return the requested outcome, or "failure" or `not_` and its name if it did not come about."""
     if asked == "success":
         return "success" if success else "failure"
     return asked if came_out(asked, frames) else f"not_{asked}"
@@ -236,7 +236,7 @@ def collect(
 
 
 def _failure(description: Description) -> str:
-    """Return why an episode failed that was to succeed; "" if it did not."""
+    """Return why an episode that should succeed failed; "" if it did not fail."""
     meta, stats = description.meta, description.stats
     if meta["success"] or meta["outcome"] not in ("failure", CORRECTED):
         return ""

@@ -20,7 +20,7 @@ from touchgoal.runtime.progress import track
 _BACKGROUND_FRAMES = 5
 _VIEW_FRAMES_BEFORE_CONTACT = 5
 _SAME_SENSOR = (
-    1.0  # counts of local change between two days of one sensor; noise of 1 count gives 0.3
+    1.0  # counts of local change of one sensor between two days; noise of 1 count gives 0.3
 )
 _LOOKED_AT = 8  # episodes of a set whose first frames are checked
 
@@ -136,13 +136,13 @@ def check_fingertips(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
 
 
 def _exchanged(frames: tuple[Picture, Picture], first: tuple[Picture, Picture]) -> bool:
-    """Whether the same two sensors changed sides; other sensors, as simulation draws them, do not count."""
+    """Whether the same two sensors changed sides; new sensors, as simulation draws them, do not count."""
     crossed = max(float(local_change(frames[k], first[1 - k]).mean()) for k in (0, 1))
     return crossed < _SAME_SENSOR and fingertips_exchanged(frames, first)
 
 
 def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a fingertip's background: the median of its first 5 frames, in training and rewards."""
+    """Return a fingertip's background, for training and rewards: the median of its first 5 frames."""
     return np.median(frames[:_BACKGROUND_FRAMES], axis=0).astype(np.uint8)
 
 

@@ -1,7 +1,8 @@
 """Recording of touches by the wand: the MMWand data set on the simulated bench.
 
-A visit puts one object on the bench and touches it several times, each time moved. A round visits
-every object once, with one gel on the wand; the next round has another. Each touch is an episode.
+A visit puts one object on the bench and touches it several times; it moves before each touch. A
+round visits every object once, with one gel on the wand; the next round has another. Each touch is
+an episode.
 """
 
 from collections.abc import Iterator

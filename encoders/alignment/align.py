@@ -54,11 +54,12 @@ def align(
 ) -> TouchEncoder:
     """Train a touch encoder.
 
-    Writes what `trainer.fit` does, and at the end the epoch with the best retrieval (mean of both
-    mAPs) on one half of the validation episodes to `encoder/`. Its retrieval on the other half, the
-    test set, is stored as `test_metrics`. Killed and resumed, it ends with the same weights as
-    uninterrupted. Returns the encoder as saved in `out_dir/encoder`, in evaluation mode, on the
-    CPU. UserError: unfit data, no such device, or a folder that does not fit `options.resume`.
+    Writes what `trainer.fit` does, and at the end the encoder to `encoder/`: that of the epoch with
+    the best retrieval (mean of both mAPs) on one half of the validation episodes. Its retrieval on
+    the other half, the test set, is stored as `test_metrics`. A killed and resumed run ends with
+    the same weights as an uninterrupted one. Returns the encoder as saved in `out_dir/encoder`, in
+    evaluation mode, on the CPU. UserError: unfit data, no such device, or a folder that does not
+    fit `options.resume`.
 
     Args:
         val: Touches of other episodes.

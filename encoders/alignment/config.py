@@ -38,7 +38,7 @@ class AlignConfig:
     """Hyperparameters of the alignment with frozen image and text towers."""
 
     backbone: Literal["vit-tiny", "vit-small", "vit-huge", "efficientnet"] = "vit-small"
-    """Touch backbone: a ViT of random weights, or EfficientNet-Lite0 up to stride 16 that begins with
+    """Touch backbone: a ViT with random initial weights, or EfficientNet-Lite0 up to stride 16 with
     ImageNet's."""
     embedding_dim: Count = 256
     """Width of an embedding. A CLIP's embeddings have their own width, which is used instead."""
@@ -103,7 +103,7 @@ class HeadsConfig:
 
 ALIGN_PRESETS: dict[str, AlignConfig] = {
     "default": AlignConfig(),  # 10,000 touches in about 15 minutes on two CPU cores
-    # Section V of the MMWand paper. What it leaves open is plain here: a constant learning rate, no
+    # Section V of the MMWand paper. Where the paper is silent: a constant learning rate, no
     # augmentation, no touches without contact. Meant for CLIP towers and a large GPU.
     "paper": AlignConfig(
         backbone="vit-huge",

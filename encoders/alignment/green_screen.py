@@ -1,6 +1,6 @@
-"""Green screen: cut what stands before it out, and put another background behind (MMWand, Figure 3).
+"""Green screen: cut out the foreground, and put another background behind it (MMWand, Figure 3).
 
-The screen is told by its chromaticity, the share of each colour in a pixel, which shading and
+The screen is recognised by its chromaticity, the share of each colour in a pixel, which shading and
 shadows hardly change. Its own chromaticity is found in the picture, so light of another tint needs
 no setting.
 """
@@ -19,7 +19,7 @@ Picture = UInt8[np.ndarray, "h w 3"]
 Alpha = Float32[np.ndarray, "h w"]
 
 _NEAR, _FAR = 0.035, 0.09  # distance from the screen's chromaticity: surely screen, surely not
-_DARK = 12  # counts of all colours together below which a pixel has no chromaticity to speak of
+_DARK = 12  # counts, sum of the colours, below which a pixel's chromaticity is unreliable
 _GREEN = 0.45  # least share of green in a screen
 _SMALLEST = 6  # px: specks below this area are noise
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -54,7 +54,7 @@ def foreground(picture: Picture) -> Alpha:
 
 
 def replace_background(picture: Picture, background: Picture) -> Picture:
-    """Return the picture before another background of any size."""
+    """Return the picture's foreground on another background of any size."""
     h, w = picture.shape[:2]
     alpha = foreground(picture)[..., None]
     behind = cv2.resize(background, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -90,7 +90,7 @@ def random_background(rng: np.random.Generator, size: tuple[int, int] = (224, 22
 
 
 def background_changer(backgrounds: str, seed: int) -> Callable[[Picture], Picture]:
-    """Return what puts a picture before random backgrounds.
+    """Return a function that replaces a picture's background by random ones.
 
     Args:
         backgrounds: "screen" leaves it as it is, "generated" draws them, or a folder of pictures.
@@ -115,7 +115,7 @@ def _chromaticity(picture: Picture) -> tuple[Float32[np.ndarray, "h w 2"], Bool[
 
 
 def _without_specks(alpha: Alpha) -> Alpha:
-    """Give specks of a few pixels to what surrounds them."""
+    """Remove specks: a few pixels get the alpha of their surroundings."""
     for solid, fill in ((alpha > 0.5, 0.0), (alpha <= 0.5, 1.0)):
         _, parts, stats, _ = cv2.connectedComponentsWithStats(
             solid.astype(np.uint8), connectivity=8

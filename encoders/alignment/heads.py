@@ -1,8 +1,7 @@
-"""Linear heads that bring frozen towers' images and sentences to frozen touch embeddings.
+"""Linear heads from frozen towers' image and sentence embeddings to frozen touch embeddings.
 
-The touch embedding stays as it is, so what it tells apart stays as it is; words and pictures are
-projected among the touches. A head W of sentences is the same as a head of touch into words, W
-transposed, so nothing is lost by the direction.
+Touch embeddings do not change, so neither does what they distinguish. Mapping sentences to touch by
+W ranks pairs like mapping touch to sentences by W transposed, so the direction loses nothing.
 """
 
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ class Paired:
 
 
 class Heads(nn.Module):
-    """Bias-free linear maps of images and sentences to touch embeddings, unit vectors all."""
+    """Bias-free linear maps from image and sentence embeddings to touch; all are unit vectors."""
 
     image_mean: Float[Tensor, " i"]
     text_mean: Float[Tensor, " t"]
@@ -43,11 +42,11 @@ class Heads(nn.Module):
         self.register_buffer("text_mean", torch.zeros(text_dim))
 
     def images(self, embeddings: Float[Tensor, "*n i"]) -> Float[Tensor, "*n d"]:
-        """Project images among touches."""
+        """Map image embeddings to touch embeddings."""
         return F.normalize(self.image(F.normalize(embeddings, dim=-1) - self.image_mean), dim=-1)
 
     def texts(self, embeddings: Float[Tensor, "*n t"]) -> Float[Tensor, "*n d"]:
-        """Project sentences among touches."""
+        """Map sentence embeddings to touch embeddings."""
         return F.normalize(self.text(F.normalize(embeddings, dim=-1) - self.text_mean), dim=-1)
 
 

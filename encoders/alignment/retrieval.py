@@ -21,16 +21,16 @@ def evaluate_retrieval(encoder: TouchEncoder, data: TouchData) -> dict[str, floa
     """Measure retrieval by cosine for touches with contact.
 
     A touch is never matched with the view of its own episode, which it could recognise by size,
-    place and light. So images are only asked for where an object has a second episode.
+    place and light. So image retrieval is measured only for objects with a second episode.
 
     Returns:
         `touch_to_text_top1`, `touch_to_image_top1`: how often the right object is nearest, an
         object being the mean embedding of its sentences or views; `chance_top1`.
         `touch_to_text_map`, `touch_to_image_map`: mean average precision over all sentences or
         views, those of the object being relevant; `chance_text_map`, `chance_image_map`.
-        `contact_accuracy` (with touches without contact): how often the nearest sentences tell
-        rightly whether there is contact; `chance_contact` is the share of the larger group.
-        None for what cannot be measured on these touches.
+        `contact_accuracy` (with touches without contact): how often the nearest sentences are right
+        about contact; `chance_contact` is the share of the larger group. None for what cannot be
+        measured on these touches.
     """
     encoder.eval()
     metrics: dict[str, float | None] = dict.fromkeys(METRICS)

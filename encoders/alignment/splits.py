@@ -1,8 +1,8 @@
-"""Four ways to hold touches out, from the easiest to the one that says most.
+"""Four ways to hold touches out, from the easiest to the hardest.
 
 The MMWand paper splits by sample: the same objects, presses of the same minute and the same
-sentences are on both sides, so a nearest neighbour in raw pixels goes far (RCT, arXiv 2606.31694,
-found most published figures to be that).
+sentences are on both sides, so a nearest neighbour in raw pixels scores high (RCT, arXiv
+2606.31694, found that it explains most published figures).
 """
 
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from jaxtyping import Bool, Int
 Split = Literal["sample", "press", "object", "sentence"]
 SPLITS: tuple[Split, ...] = ("sample", "press", "object", "sentence")
 TEST_SHARE = 1048 / 5182
-"""The paper's."""
+"""The paper's share of test touches."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """What is trained on and what is judged.
+    """Training and test side of a split.
 
     Attributes:
         train, test: rows of the touches.
-        train_text, test_text: which sentences.
+        train_text, test_text: whether each sentence is on that side.
     """
 
     train: Int[np.ndarray, " a"]
@@ -44,7 +44,7 @@ def split_touches(
     Args:
         split: "sample": touches at random. "press": whole visits, in which an object is pressed
             several times with one gel. "object": whole objects with their sentences. "sentence":
-            touches at random and one sentence an object, by which alone is judged.
+            touches at random, and one sentence per object; only these sentences are tested.
         label: object of each touch.
         visit: visit of each touch.
         describes: whether sentence j is on object i.

@@ -51,12 +51,12 @@ class TouchEncoder(BaseTouchEncoder):
     """Encoder of touch, images and texts to unit vectors of one space.
 
     As in ImageBind, the touch head is a LayerNorm (the backbone's last layer), pooling and a
-    bias-free linear layer. Towers not pretrained together get bias-free linear heads as well;
-    embeddings of others are only normalised.
+    bias-free linear layer. Towers not pretrained together get bias-free linear heads as well; a
+    CLIP's embeddings are only normalised.
     """
 
     def __init__(self, config: TouchEncoderConfig) -> None:
-        """Build an untrained encoder (of EfficientNet: ImageNet's); UserError for an unknown sensor."""
+        """Build it untrained (EfficientNet with ImageNet's weights); UserError for an unknown sensor."""
         preprocess = preprocessor_for(config.sensor)
         super().__init__(preprocess, config.embedding_dim)
         self.config = config

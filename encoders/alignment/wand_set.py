@@ -98,7 +98,7 @@ class WandSet:
     def embed_views(
         self, towers: Towers, change: Callable[[Picture], Picture] = lambda view: view
     ) -> Float32[np.ndarray, "n 1 i"]:
-        """Embed the wand's own view before contact, which shows what is about to be touched.
+        """Embed the wand's own view before contact, which shows the place to be touched.
 
         Each view is changed first; embeddings are not normalised. Long work.
         """

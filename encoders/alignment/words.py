@@ -19,8 +19,8 @@ from touchgoal.encoders.whitening.simulated_surfaces import pressed_surfaces
 from touchgoal.encoders.whitening.surface_words import surface_sentences
 from touchgoal.runtime.progress import track
 
-_VISIBLE = 0.2  # length of an embedding below which a touch shows nothing
-_PRESSES = 2  # of each surface
+_VISIBLE = 0.2  # least length of an embedding of a visible touch
+_PRESSES = 2  # presses of each surface
 
 
 def add_words(

@@ -95,7 +95,7 @@ class _LeftOut:
 
 
 def _allowed() -> dict[tuple[str, str], Callable[..., Any]]:
-    """Return all that a checkpoint may call; wrapped, for a pickle can change attributes."""
+    """Return all that a checkpoint may call; wrapped, because a pickle can set attributes."""
     return {
         ("collections", "OrderedDict"): OrderedDict,
         ("torch", "Size"): torch.Size,

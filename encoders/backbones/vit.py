@@ -24,10 +24,11 @@ class ViTConfig:
     heads: int = 3  # attention heads; they divide `width`
     mlp_ratio: float = 4.0  # hidden width of a block's MLP over `width`
     class_token: bool = False  # prepend a learned token and pool by it; otherwise pool by the mean
-    registers: int = 0  # learned tokens without position, not put out (Darcet et al. 2024)
+    # learned tokens without position, not part of the output (Darcet et al. 2024)
+    registers: int = 0
     # initial value of learned factors on both branches of a block (Touvron et al. 2021), if any
     layer_scale: float | None = None
-    tubelet: int = 1  # frames in a token; 1 for images, more for clips of any multiple of it
+    tubelet: int = 1  # frames in a token: 1 for images; clips have a multiple of it
     frames: int = 1  # frames of a clip; 1 for images
     learned_positions: bool = False  # learn the position codes; the input size is then fixed
     norm_epsilon: float = 1e-5  # epsilon of every LayerNorm
@@ -79,7 +80,7 @@ def sinusoidal_positions(
 def _known_positions(
     rows: int, columns: int, width: int, times: int | None = None
 ) -> Float[Tensor, "n {width}"]:
-    """Return the same, computed once; not to be changed."""
+    """Return cached `sinusoidal_positions`; not to be modified."""
     with torch.inference_mode(False):
         return sinusoidal_positions(rows, columns, width, times)
 
@@ -148,7 +149,7 @@ class ViT(nn.Module):
                 # keeps the variance of the residual stream independent of depth, as in GPT-2
                 nn.init.xavier_uniform_(weight, gain=1 / math.sqrt(2 * c.depth))
         if self.registers is not None:
-            # equal ones would stay equal: nothing but their values tells them apart
+            # equal registers would stay equal, because only their values differ
             nn.init.normal_(self.registers, std=0.02)
 
     def embed_patches(self, images: Float[Tensor, "b c *t h w"]) -> Float[Tensor, "b n d"]:
@@ -259,9 +260,7 @@ def random_masking(
 
 def _initialise(module: nn.Module) -> None:
     if isinstance(module, nn.Linear):
-        nn.init.xavier_uniform_(
-            module.weight
-        )  # as MAE: right for narrow backbones as for wide ones
+        nn.init.xavier_uniform_(module.weight)  # as in MAE; suits narrow and wide backbones
         nn.init.zeros_(module.bias)
     elif isinstance(module, nn.Conv2d | nn.Conv3d) and module.bias is not None:
         fan_in = module.weight[0].numel()

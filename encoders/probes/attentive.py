@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-_NARROWER = 4  # than the block: the hidden layer of the head, 192 of 768 as published
+_NARROWER = 4  # width of the block over that of the head's hidden layer: 768 over 192, as published
 
 
 class AttentivePooler(nn.Module):
@@ -36,8 +36,8 @@ class AttentivePooler(nn.Module):
 
     def forward(self, tokens: Float[Tensor, "b t f"]) -> Float[Tensor, "b d"]:
         """Return the pooled vector."""
-        # There is one query for all tokens: its product with a key is one with the token itself, and values are
-        # made of the tokens' weighted sum. The keys' bias is the same for all tokens, so it drops out of the softmax.
+        # With a single query the key projection moves to the query, and the value projection is applied once, to the
+        # weighted sum of tokens. The keys' bias adds the same to all tokens, so it drops out of the softmax.
         tokens = self.norm1(tokens)
         key, value = self.kv.weight.view(2, self.heads, -1, tokens.shape[2])
         q = self.q(self.query).view(self.heads, -1)

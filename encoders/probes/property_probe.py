@@ -15,7 +15,7 @@ STRENGTHS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 N_RANKS = 3
 _FOLDS = 10
 _BOOTSTRAPS = 1000
-_SHRINKAGE = 0.6  # towards the within-object covariance; 0.6 to 0.98 separate objects alike
+_SHRINKAGE = 0.6  # share of a sphere in the within-object covariance; 0.6 to 0.98 do as well
 
 Objects = Shaped[np.ndarray, " n"]
 

@@ -39,7 +39,7 @@ class DinoHead(nn.Module):
     def forward(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n p"]:
         """Return scores from -1 to 1."""
         unit = F.normalize(self.mlp(x).float(), dim=1)
-        with torch.autocast(x.device.type, enabled=False):  # temperatures blow rounding up
+        with torch.autocast(x.device.type, enabled=False):  # low temperatures amplify rounding
             return unit @ F.normalize(self.prototypes.weight, dim=1).T
 
 

@@ -47,7 +47,7 @@ class Predictor(nn.Module):
 
 
 class JointEmbeddingPrediction(SelfDistillation):
-    """Backbone of partial input, predictor, and teacher of the whole; subclasses draw the parts."""
+    """Backbone on part of the input, predictor, and teacher on all of it; subclasses draw parts."""
 
     def __init__(self, config: PredictorConfig, backbone: TouchBackbone, steps: int) -> None:
         super().__init__(config, backbone, steps)

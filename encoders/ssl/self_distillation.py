@@ -1,6 +1,6 @@
 """Teacher and student of DINO, I-JEPA and V-JEPA.
 
-The teacher, a moving average of the student, is measured and saved: it is steadier.
+The teacher, a moving average of the student, is measured and saved, because it varies less.
 """
 
 import copy

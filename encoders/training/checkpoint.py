@@ -61,7 +61,7 @@ class Record:
         self._tensorboard = SummaryWriter(str(out_dir))
 
     def write(self, history: list[dict[str, float]], state: Mapping[str, Any]) -> None:
-        """Write the state after an epoch; if killed, the older or these files remain."""
+        """Write the state after an epoch; a kill leaves the old or the new checkpoint, whole."""
         states = {name: part.state_dict() for name, part in state.items()}
         with atomic_write(self._dir / _CHECKPOINT) as unfinished:
             torch.save({**self._head, "history": history, **states}, unfinished)

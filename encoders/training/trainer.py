@@ -47,8 +47,9 @@ class OptimizerConfig:
     warmup: float = 0.1  # share of the steps in which the rate rises linearly from 0
     max_warmup_steps: float = math.inf  # upper bound of these steps
     final_lr: float = 0.0  # last rate over `lr`, reached by a cosine; 1 keeps it constant
-    max_grad_norm: float | None = None  # norm that gradients are clipped to; None clips nothing
-    final_weight_decay: float | None = None  # reached by a cosine; None keeps it constant
+    max_grad_norm: float | None = None  # gradients are clipped to this norm; None: no clipping
+    # weight decay at the end, reached by a cosine; None: constant
+    final_weight_decay: float | None = None
 
     def build(self, module: nn.Module) -> torch.optim.Optimizer:
         """Return the optimizer of a module's parameters."""
@@ -101,8 +102,8 @@ class Training:
     # parameters that require a gradient are trained
     loss: nn.Module
     n_samples: int  # samples of an epoch
-    # makes a batch of these samples on the CPU; all that is random about it, and one entry a
-    # sample, comes from the noise
+    # makes a batch of these samples on the CPU, one entry per sample; its random numbers come from
+    # the `BatchNoise`
     batch: Callable[[Int[Tensor, " b"], BatchNoise], dict[str, Any]]
     optimizer: OptimizerConfig  # settings of the optimizer
     identity: Mapping[str, Any]  # JSON-able: data and settings; a run resumes only with the same
@@ -283,14 +284,14 @@ def check_device(device: str) -> None:
 
 
 def _accelerator(device: str) -> Accelerator:
-    """Return an Accelerator; it fixes a process's precision, so autocast sees to bfloat16."""
+    """Return an Accelerator without mixed precision, which it fixes per process; we autocast."""
     check_device(device)
     kind, _, index = device.partition(":")
     if index:
         torch.cuda.set_device(int(index))
     try:
         accelerator = Accelerator(cpu=kind == "cpu", mixed_precision="no")
-    except ValueError:  # the state of this process is of a GPU
+    except ValueError:  # Accelerate's state in this process is of a GPU
         accelerator = Accelerator(mixed_precision="no")
     if accelerator.device.type != kind:
         raise UserError(

@@ -1,8 +1,8 @@
-"""What a random surface feels like, in words: its roughness and bumpiness, from its height map.
+"""Sentences on how a random surface feels: roughness and bumpiness, from its height map.
 
-The ranks are PhysiCLeAR's. Hardness has no words here: how far a random surface gives way tells
-little of how it looks on a real gel, and such words did harm (real hardness at chance, seen objects
-from .80 to .59).
+The ranks are PhysiCLeAR's. Hardness has no words here: the softness of a random surface says little
+about its real tactile image, and such words did harm (hardness of real objects at chance, accuracy
+on seen objects from 0.80 to 0.59).
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from touchgoal.encoders.whitening.text_head import RANK_WORDS
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, TILE_PITCH, Surface
 
-_FINE = 1.5e-3  # m, wavelength: what is finer is roughness, what is coarser bumps
+_FINE = 1.5e-3  # m, wavelength: finer texture is roughness, coarser is bumps
 # um, standard deviations of the fine and of the coarse part of a texture, between the three ranks: a gel
 # shows 3 um of fine relief faintly, and 12 um plainly.
 _ROUGH, _BUMPY = (3.0, 12.0), (10.0, 50.0)
@@ -34,7 +34,7 @@ def surface_ranks(surface: Surface) -> tuple[int, int]:
     spectrum = np.fft.rfft2(surface.texture)  # a tile repeats, so the split is exact
     along, across = np.fft.fftfreq(TILE, TILE_PITCH), np.fft.rfftfreq(TILE, TILE_PITCH)
     is_fine = np.hypot(along[:, None], across) > 1 / _FINE
-    spectrum[0, 0] = 0  # height itself is neither
+    spectrum[0, 0] = 0  # mean height is neither
     parts = (np.fft.irfft2(np.where(kept, spectrum, 0)) for kept in (is_fine, ~is_fine))
     fine, coarse = (1e6 * float(part.std()) for part in parts)
     return int(np.searchsorted(_ROUGH, fine)), int(np.searchsorted(_BUMPY, coarse))

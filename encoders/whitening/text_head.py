@@ -18,8 +18,8 @@ RANK_WORDS = (
     ("smooth", "slightly rough", "rough"),
     ("flat", "slightly bumpy", "bumpy"),
 )
-"""What a rank of hardness, roughness and bumpiness is called."""
-_STRENGTH = 0.003  # of the ridge; on real objects, 100 times more or less makes no difference
+"""Words for the ranks of hardness, roughness and bumpiness."""
+_STRENGTH = 0.003  # of the ridge; on real objects, 100 times more or less changes nothing
 
 EmbedTexts = Callable[[list[str]], Float[Tensor, "k t"]]
 

@@ -150,9 +150,9 @@ def write_table(table: pa.Table, description: Description) -> bytes:
         table.replace_schema_metadata(footer),
         file,
         row_group_size=FRAMES_PER_ROW_GROUP,
-        compression="none",  # PNG is compressed; the numbers are a thousandth of it
+        compression="none",  # PNG is compressed; numbers are a thousandth of the bytes
         use_dictionary=False,
-        write_statistics=False,  # would repeat whole images as a column's least and greatest
+        write_statistics=False,  # they would repeat whole images as a column's min and max
         write_page_checksum=True,
     )
     return file.getvalue()

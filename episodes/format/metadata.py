@@ -122,7 +122,7 @@ class SetMetadata:
         return row
 
     def write(self, root: Path) -> None:
-        """Write all of meta/, each file atomically and info.json, which commits, last."""
+        """Write all of meta/, each file atomically; info.json comes last and commits the change."""
         write_file(root / set_files.EPISODES, _parquet(self.episodes))
         write_file(root / set_files.STATS, _json(self.stats))
         write_file(root / set_files.TASKS, _parquet(_tasks_table(self.tasks)))

@@ -21,7 +21,8 @@ INFO = "meta/info.json"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 TASKS = "meta/tasks.parquet"
 STATS = "meta/stats.json"
-_COUNTS = {"fps": 1, "total_episodes": 0, "total_frames": 0, "total_tasks": 0}  # least values
+# Keys and their least values.
+_COUNTS = {"fps": 1, "total_episodes": 0, "total_frames": 0, "total_tasks": 0}
 
 Row = dict[str, Any]
 
@@ -83,7 +84,7 @@ def read_video(root: Path, name: str, crc32: int) -> bytes:
 
 
 def load_info(root: Path) -> dict[str, Any]:
-    """Read meta/info.json. UserError: no set, one of another version, or a value that cannot be."""
+    """Read meta/info.json. UserError: no set, another version, or an impossible value."""
     if not (root / INFO).exists():
         raise UserError(
             f"{root} is not a set of episodes (it has no {INFO}): give the folder that a recording "

@@ -29,7 +29,7 @@ class ForceGrasp:
     video: Path  # video file
     force: Float[np.ndarray, " n"]  # of each frame, N, as measured, with spikes and drift
     width: Float[np.ndarray, " n"]  # gripper width of each frame, m
-    corners: Corners | None = None  # of the gel in the images, px, to rectify them
+    corners: Corners | None = None  # corners of the gel in the images, px; None: do not rectify
 
     def frames(self) -> UInt8[np.ndarray, "m h w 3"]:
         """Return as many RGB frames as `force` has: raw, or rectified to a GelSight Wedge's gel."""

@@ -1,6 +1,6 @@
 """Pickles of published data sets, read without running what is in them.
 
-Python's own unpickler, whose only names are those by which numpy writes arrays and numbers.
+Python's own unpickler, restricted to the names with which numpy writes arrays and numbers.
 """
 
 import pickle
@@ -48,5 +48,5 @@ def read_plain_pickle(path: Path) -> Any:
         raise
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
-    except Exception as error:  # the unpickler meets damage with whatever error it runs into
+    except Exception as error:  # on damaged files the unpickler raises any error
         raise UserError(f"{path} is damaged, or no pickle of plain values: get it again") from error
