@@ -50,7 +50,7 @@ def load_record(name: str) -> dict[str, Any]:
 
 
 def records_of(benchmark: str) -> list[str]:
-    """Return the names of a benchmark's records, or that very name; UserError if there is none."""
+    """Return the names of a benchmark's records, or a record's own name; UserError if none."""
     start = f"touchgoal benchmark {benchmark} "
     names = [name for name, quoted in QUOTED.items() if f"{quoted.command} ".startswith(start)]
     if benchmark in QUOTED and benchmark not in names:
@@ -98,7 +98,7 @@ def measure(name: str) -> None:
 
 def write_record(name: str, command: str, printed: list[str], metrics: dict[str, Any]) -> None:
     """Write a record; its metrics stand on one line."""
-    metrics.pop("command", None)  # has the folders of this machine
+    metrics.pop("command", None)  # it contains folders of this machine
     asked = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
     commit = subprocess.check_output(asked, text=True).strip()
     record = {

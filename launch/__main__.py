@@ -131,7 +131,7 @@ def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
 
     module = importlib.import_module(f"touchgoal.launch.{name.replace('-', '_')}")
     chosen, prog = module, f"touchgoal {name}"
-    if hasattr(module, "choose"):  # a command of commands: benchmark NAME
+    if hasattr(module, "choose"):  # a command with subcommands: benchmark NAME
         prog = " ".join([prog, *options[:1]])
         chosen, options = module.choose(options)
     envs = getattr(chosen, "ENVS", None)
@@ -142,7 +142,7 @@ def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
 
 
 def _unknown(name: str) -> str:
-    families = {command.split("-")[0] for command in COMMANDS}  # train of train-policy
+    families = {command.split("-")[0] for command in COMMANDS}  # such as train, of train-policy
     close = get_close_matches(name, [*COMMANDS, *families], 1, cutoff=0.7)
     meant = [command for command in COMMANDS if close and command.startswith(close[0])]
     guess = f"; did you mean {' or '.join(meant)}?" if meant else ""
@@ -160,7 +160,7 @@ def _until_reader_leaves() -> Iterator[None]:
         stdout = select.poll()
         stdout.register(sys.stdout.fileno(), 0)
         if not any(event & select.POLLERR for _, event in stdout.poll(0)):
-            raise  # another pipe's
+            raise  # not stdout's pipe
         # The rest of the buffer would fail again at the interpreter's end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(128 + signal.SIGPIPE)

@@ -24,8 +24,8 @@ class _Source:
     device: str = "cpu"
     """Torch device of both: cpu, cuda or cuda:1."""
     out: Path | None = None
-    """Folder of the run, with annotations.jsonl and left_out.jsonl. Recordings that stand in them are not
-    annotated again, so the same line continues an interrupted run."""
+    """Folder of the run, with annotations.jsonl and left_out.jsonl. Recordings listed there are skipped,
+    so the same command continues an interrupted run."""
 
 
 @checked_dataclass
@@ -49,7 +49,7 @@ def main(config: Config) -> None:
     models = PretrainedModels(config.detector, config.captioner, config.device)
     out = open_run(config.out, "annotate", config, adds=True)
     with on_interruption(
-        lambda: f"finished recordings are in {out}; the same line with --out {out} continues"
+        lambda: f"finished recordings are in {out}; the same command with --out {out} continues"
     ):
         metrics = annotate_all(recordings, root, models, config, out)
     write_json(out / "metrics.json", metrics)

@@ -32,9 +32,9 @@ class Config:
     it off for a sensor whose lamps are placed otherwise."""
     illumination_exponent: Positive | None = None
     """Power of the background's brightness by which the response varies over the image; default: the
-    one that reads the balls at their size (four fits, a few minutes)."""
+    one with which depth shows the balls at their true radius (four fits, a few minutes)."""
     squares: bool = False
-    """Let the response vary with the square of the place, too, for light that falls off towards the borders;
+    """Let the response vary with the squared position, too, for light that falls off towards the borders;
     from 40 presses or more all over the gel."""
     out: Path | None = None
     """Folder of the run; the sensor file goes to its `sensor_file/`."""

@@ -23,13 +23,13 @@ class Config:
     """Model of the sensor (`touchgoal list sensors`), or the folder that calibrate made of it."""
     corners: Corners | None = None
     """Corners of the gel in the camera's picture, x and y in px: top left, top right, bottom left, bottom
-    right; of a camera that sees its gel at an angle (gelsight_wedge)."""
+    right; for a camera that sees its gel at an angle (gelsight_wedge)."""
     ball_mm: Positive | None = None
     """Radius of the ball that presses, mm: what the depth shows is compared with it."""
     weight_g: Positive | None = None
     """Weight that lies on the gel, g: the force that the pictures show is compared with it."""
     exposure: Positive | None = None
-    """Exposure to lock, in the camera's units; not given: as it is set."""
+    """Exposure to lock, in the camera's units; default: as it is set."""
     seconds: Positive = 20.0
     """For how long a live sensor is watched, s; Ctrl-C ends earlier."""
     out: Path | None = None

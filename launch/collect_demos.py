@@ -31,12 +31,12 @@ class Config:
     """Task to demonstrate."""
     out: Path | None = None
     """Folder of the run; episodes are appended to its `episodes/`. Seeds that it holds are skipped, so
-    the same line continues an interrupted recording."""
+    the same command continues an interrupted recording."""
     episodes: Count = 10
     """Number of episodes of each outcome."""
     outcomes: tuple[Outcome, ...] = ("success",)
-    """Outcomes to ask the expert for; pick-place has poor successes and failures on purpose, too. One
-    that does not come about is recorded as `not_` and its name."""
+    """Outcomes to ask the expert for; pick-place has poor successes and failures on purpose, too. An
+    episode that ends otherwise is recorded with outcome `not_` and the name."""
     feedback: bool = False
     """pick-place: the expert plans anew at every tick; policies learn better from that."""
     policy: str | None = None
@@ -83,7 +83,7 @@ def main(config: Config) -> None:
         print(f"nothing left to record: {len(EpisodeSet(root))} episodes; more: --seed {next_seed}")
         return
     most = None if acts else _MAX_FAILURES
-    kept = f"finished episodes are in {root}; the same line with --out {out} continues"
+    kept = f"finished episodes are in {root}; the same command with --out {out} continues"
     try:
         with on_interruption(lambda: kept):
             metas = collect(root, config.env, missing, config.workers, roles, most)

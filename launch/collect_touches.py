@@ -2,8 +2,9 @@
 
 With --wand FILE a person presses a real wand on real objects. FILE names its devices: copy
 control/cell/examples/wand.toml. Hold the wand free and still until it says "press"; press slowly by hand,
-hold until it says "lift", and lift. It names the force that is still wanted. Every touch is on disk before
-the next begins; Ctrl-C ends, and the same line with --out continues. Once an object:
+hold until it says "lift", and lift. It asks for the force range with the fewest touches. Every touch is on
+disk before the next begins; Ctrl-C ends, and the same command with --out continues. Run it once per
+object:
 
     touchgoal collect-touches --wand wand.toml --object apple --out runs/wand
     touchgoal collect-touches --wand wand.toml --object mug --description "smooth, hard and cold" --out runs/wand
@@ -24,14 +25,14 @@ class Config:
 
     out: Path | None = None
     """Folder of the run; the episodes go to its `episodes/`. Only missing ones are recorded, so the same
-    line continues an interrupted recording."""
+    command continues an interrupted recording."""
     body: Literal["wand", "slide"] = "wand"
     """wand: each of 102 objects touched anywhere with 0 to 20 N, with four views, force and sentences (the
     MMWand data set). slide: one object slid and turned over the sensor for a second, 66 pictures at 60 Hz,
     to learn from without labels; Sparsh's 460,000 pictures are 7,000 of these."""
     episodes: Count | None = None
-    """Number of touches or slides; by default 5182 touches, as MMWand has, or 300 slides. Of a real wand: of
-    this object; by default no end."""
+    """Number of touches or slides; by default 5182 touches, as MMWand has, or 300 slides. With a real wand:
+    number of touches of this object; by default without end."""
     sensor: str | None = None
     """Fingertip sensor, by name or folder of a sensor file; by default gelsight_mini for the wand,
     gelsight_mini_markers for slides."""
@@ -47,7 +48,7 @@ class Config:
     description: tuple[str, ...] = ()
     """How an object of your own feels; three to five sentences in different words are best."""
     new_gel: bool = False
-    """Another gel is on the real wand than at the last touch in --out."""
+    """The gel of the real wand was exchanged after the last touch in --out."""
 
 
 def main(config: Any) -> None:
@@ -80,7 +81,7 @@ def _simulate(config: Any) -> None:
     root = out / "episodes"
     recorded = (root / INFO).exists() and len(EpisodeSet(root)) >= count
     with on_interruption(
-        lambda: f"finished episodes are in {root}; the same line with --out {out} continues"
+        lambda: f"finished episodes are in {root}; the same command with --out {out} continues"
     ):
         if config.body == "wand":
             episodes = record_touches(root, sensor, config.seed, count, config.workers)
@@ -113,7 +114,7 @@ def _record_real(config: Any) -> None:
     episodes = record_real_touches(root, wand, name, descriptions, config.episodes, config.new_gel)
     if episodes is None:
         raise UserError("no touch was recorded")
-    print(f"{len(episodes)} touches in {root}; the same line with --out {out} continues")
+    print(f"{len(episodes)} touches in {root}; the same command with --out {out} continues")
     print(_table_row(episodes, "human"))
 
 

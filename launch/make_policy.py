@@ -46,7 +46,7 @@ class Config:
     """Episodes in each round of corrections; default: 200 for pick-place, 80 for the maze."""
     rounds: CountOrNone | None = None
     """Rounds of DAgger: the policy acts, the expert's actions are recorded, the policy is trained again;
-    default and most: 5 for pick-place, 3 for the maze."""
+    default and maximum: 5 for pick-place, 3 for the maze."""
     epochs: Count | None = None
     """Passes over the data in each training; default: 16 for pick-place, 5 for the maze."""
     trials: CountOrNone = 24
@@ -54,7 +54,7 @@ class Config:
     touch: Annotated[Path | None, RARE] = None
     """For new pads: run folder of a touch encoder (the maze) or a state estimator (pick-place)."""
     learn_touch: bool = False
-    """For new pads, the maze: first train a touch encoder without labels on the demonstrations."""
+    """For new pads, maze only: first train a touch encoder without labels on the demonstrations."""
     resume: bool = False
     """Continue an interrupted run in `out`."""
     workers: Count = os.cpu_count() or 1
@@ -95,7 +95,7 @@ def main(config: Config) -> None:
 
 
 def _task_of(command: str) -> str:
-    """Return a command without its number of processes, which does not change what it makes."""
+    """Return a command without its number of processes, which does not change the result."""
     return re.sub(r" --workers \d+", "", command)
 
 
@@ -104,7 +104,7 @@ def _run(step: list[str]) -> None:
     from touchgoal.launch.__main__ import read_options
 
     folder, resume = Path(step[step.index("--out") + 1]), []
-    if step[0] != "collect-demos":  # which skips the seeds that it has recorded
+    if step[0] != "collect-demos":  # collect-demos itself skips recorded seeds
         resume = ["--resume"] * has_checkpoint(folder)
         if not resume:  # interrupted before its first epoch was finished
             shutil.rmtree(folder, ignore_errors=True)
@@ -156,7 +156,7 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
 def _demonstrations(
     config: Config, out: Path, many: int, train: int, validation_env: list[str], env: list[str]
 ) -> list[list[str]]:
-    """Return the recordings of the expert; a thirteenth as many as `many` are for validation."""
+    """Return the recordings of the expert: `train` episodes, and `many` / 13 for validation."""
     held_out = max(1, many // 13)
     seed = seeds.VALIDATION.first(held_out, "--demonstrations")
     return [

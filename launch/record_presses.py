@@ -29,14 +29,14 @@ class Config:
     exposure: Positive | None = None
     """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); a device needs it."""
     white_balance: Annotated[int, Field(ge=1000, le=15_000)] | None = None
-    """White balance to lock, K; not given: as it is set."""
+    """White balance to lock, K; default: as it is set."""
     corners: Corners | None = None
     """Corners of the gel in the camera's picture, x and y in px: top left, top right, bottom left, bottom
-    right; of a camera that sees its gel at an angle (gelsight_wedge)."""
+    right; for a camera that sees its gel at an angle (gelsight_wedge)."""
     presses_per_part: Count = 2
     """Presses wanted in each of the 12 parts of the picture."""
     port: Port = 8095
-    """Where a browser on this computer finds the live picture."""
+    """Port of the live picture, for a browser on this computer."""
     resume: bool = False
     """Go on in the folder --out, with another ball or more presses of this one."""
     calibrate: bool = True

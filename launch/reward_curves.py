@@ -40,9 +40,9 @@ class Config:
     the one that ships for the episodes' sensor. Sentences need one that is aligned with texts."""
     towers: str | None = None
     """Image and text networks: offline, or a CLIP (Hugging Face id or folder), which also compares
-    images with sentences. Without --encoder, only images are measured with them."""
+    images with sentences. If given without --encoder, only images are measured."""
     normalizer: str | None = None
-    """What normalises the distances: a normalizer.json of fit-normalizer; encoder, the one that comes
+    """Normalizer of the distances: a normalizer.json of fit-normalizer; encoder, the one that comes
     with the encoder; or none. Default: the encoder's one for simulated pick-and-place, else none."""
     gamma: Annotated[float, Field(gt=0, le=1)] = 0.99
     """Discount factor of the potential-based reward gamma * Phi' - Phi, in (0, 1]. Set it to the
@@ -102,7 +102,7 @@ def main(config: Config) -> None:
         measurement.run(config.workers)
     except KeyboardInterrupt as interruption:
         kept = f"{len(measurement.records)} of {total} trajectories are measured"
-        interruption.add_note(f"{kept}; the same line with --out {out} continues")
+        interruption.add_note(f"{kept}; the same command with --out {out} continues")
         raise
     skipped = [*source.skipped, *measurement.skipped]
     summary = write_skipped(skipped, total, out)

@@ -89,7 +89,7 @@ def _record_attempt(
     from touchgoal.sim_envs.experts.teleoperator import HELP, Teleoperator
 
     observation, info = env.reset(seed=spec.seed, options=spec.options)
-    keyboard.read_keys()  # those meant for the last wire
+    keyboard.read_keys()  # drop keys typed for the last wire
     hand, ticks, due = Teleoperator(env, config), [], time.monotonic()
     for tick in run(env, hand, observation, info):
         ticks.append(tick)

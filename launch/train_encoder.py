@@ -41,7 +41,7 @@ class Align(TrainerOptions):
     of them chooses the best epoch; the other half is the test set. Of touches of the wand a fifth is
     held out instead."""
     split: Annotated[Split, RARE] = "press"
-    """What is held out of touches of the wand."""
+    """Units held out of touches of the wand: single touches, visits, objects or sentences."""
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""
     preset: Preset = "default"
@@ -155,7 +155,7 @@ class Surfaces:
 
 @checked_dataclass
 class Words:
-    """Give an encoder of `surfaces` words and pictures: maps into its embeddings, which stay as they are."""
+    """Add words and pictures to an encoder of `surfaces`: maps to its embeddings, which do not change."""
 
     data: Path
     """Touches of objects, recorded by `collect-touches --body wand`."""
@@ -166,7 +166,7 @@ class Words:
     surfaces: Annotated[Count, RARE] = 2000
     """Random surfaces that teach roughness and bumpiness beside the objects."""
     backgrounds: str = "screen"
-    """What stands behind the objects in the views: screen (the green screen, as recorded), generated, or a
+    """Background of the objects in the views: screen (the green screen, as recorded), generated, or a
     folder of pictures."""
     heads: HeadsConfig = HeadsConfig()
     """Training of the maps."""

@@ -54,7 +54,7 @@ class Config(TrainingOptions):
     PRESETS: ClassVar = {"paper": _PAPER}
 
     data: Path
-    """Episode set to train on: successful episodes, and those in which an expert corrected one."""
+    """Episode set to train on: successful ones, and those in which an expert corrected a policy."""
     validation: Path
     """Episode set for the validation loss; it must share no recording with --data."""
     preset: Literal["default", "paper"] = "default"

@@ -40,16 +40,16 @@ class Estimator(Protocol):
 class LearnedPolicy:
     """A trained network that acts, one episode after the other.
 
-    It does `execution_horizon` ticks of a plan, then the next plan's. The same seed and
-    observations give the same actions. Torch computes each plan on one thread: two lose badly when
-    the other core is taken.
+    It executes `execution_horizon` ticks of each plan. The same seed and observations give the same
+    actions. Torch computes each plan on one thread: two are much slower when another process uses a
+    core.
 
     Attributes:
         config: of the network.
         touch: embedder of the fingertips; None for a policy without touch.
         directory: where it was read from; None if it never was on disk.
-        plan_ticks: control ticks from an observation to its plan. The next plan is asked for so
-            much earlier, and its actions for the ticks that have gone by are left out.
+        plan_ticks: control ticks from an observation to its plan. The next plan is requested that
+            much earlier, and its actions for the ticks gone by are dropped.
         history_ticks: number of observations that `plan` takes: the network's own, and those before
             them that the touch encoder looks back to.
     """
@@ -65,13 +65,13 @@ class LearnedPolicy:
         """Get ready for an episode.
 
         UserError: the embedder is not the training's, an estimator is missing, or plans are too
-        short to come so late.
+        short for this delay.
 
         Args:
             network: for inference.
             touch: the embedder that the network was trained with.
             estimator: estimates the columns that only a simulator knows; None if there are none.
-            plan_ticks: see above. On the first tick the arm stands, and the plan is waited for.
+            plan_ticks: see above. On the first tick the arm stands still until the plan is there.
             directory: see above.
         """
         self.config = config = network.config
@@ -92,13 +92,13 @@ class LearnedPolicy:
         return f"LearnedPolicy({str(self.directory or '')!r}, task={self.config.task!r})"
 
     def reset(self, seed: int = 0) -> None:
-        """Begin an episode with the next observation, untouched; `seed` is of the plans' noise."""
+        """Begin an episode, whose first observation is untouched; `seed` is that of the plans' noise."""
         self._generator = torch.Generator().manual_seed(seed)
         self._first: Observation = {}
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
         self._recent: list[Observation] = []
         self._todo: list[np.ndarray] = []  # actions of the present plan
-        self._next: list[np.ndarray] = []  # of the one that is on its way
+        self._next: list[np.ndarray] = []  # actions of the plan that comes next
 
     def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
         """Return the action (`features.ACTION`) for the next tick."""
@@ -115,14 +115,14 @@ class LearnedPolicy:
         return self._todo.pop(0)
 
     def _begin_next_plan(self) -> None:
-        """Go on with the next plan where the present one is done."""
+        """Start the next plan if the present one is done."""
         if not self._todo:
             self._todo, self._next = self._next, []
 
     def plan(self, history: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
-        """Return actions from the latest of the last `history_ticks` observations on, oldest first.
+        """Return actions, the first for the latest of `history_ticks` observations (oldest first).
 
-        The oldest one of an episode's first call is its first observation, untouched.
+        In an episode's first call the oldest observation is the untouched first one.
         """
         with one_thread():
             self.embed(history)
@@ -132,7 +132,7 @@ class LearnedPolicy:
             return self._network.plan(batch, self._generator)[0].numpy()
 
     def embed(self, history: Sequence[Observation]) -> None:
-        """Embed observations ahead of a `plan` that begins with some of them: most of the work."""
+        """Embed observations before `plan` needs them: most of the work."""
         self._first = self._first or history[0]
         ends = range(len(history) - self.config.observation_horizon + 1, len(history) + 1)
         with one_thread():
@@ -230,7 +230,7 @@ class LearnedPolicy:
         self._check_delay(max(task.resolved_deployment().plan_ticks or (0,)))
 
     def _check_delay(self, plan_ticks: int) -> None:
-        """Raise UserError if plans are too short to come so late."""
+        """Raise UserError if plans are too short for this delay."""
         config = self.config
         spare = config.prediction_horizon - config.execution_horizon
         if not 0 <= plan_ticks <= min(spare, config.execution_horizon):

@@ -35,7 +35,7 @@ AnyPolicy = str | Path | LearnedPolicy | Policy | type
 
 
 def scripted(task: TaskName) -> str:
-    """Return the task's policy without learning that an arm can run."""
+    """Return the task's scripted policy that an arm can run."""
     return "follower" if task == "bead-maze" else "expert"
 
 

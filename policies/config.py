@@ -21,11 +21,10 @@ Head = Literal["small", "published", "tiny", "regression"]
 ArmState = Literal["measured", "commanded"]
 TouchInput = Literal["wrench", "embedding"]
 ActionRepresentation = Literal["delta", "relative", "absolute", "base_twist", "body_twist"]
-"""How a plan is written; see `train_policy.Config`. "relative" is UMI's word (Chi et al. 2024). The
-hand's displacement and rotation (m, rad) are to first order. "base_twist" adds the third joint's
-change for the elbow and is nearly the same wherever on the table the hand does the same; with
-"body_twist" the elbow goes where the joints move least. The gripper's width is a target in all of
-them."""
+"""Representation of a plan; see `train_policy.Config`. "relative" is UMI's word (Chi et al. 2024).
+The hand's displacement and rotation (m, rad) are to first order. "base_twist" adds the third
+joint's change for the elbow, and hardly depends on the hand's place on the table; with "body_twist"
+the elbow goes where the joints move least. The gripper's width is a target in all of them."""
 Box = tuple[int, int, int, int]
 
 
@@ -94,8 +93,8 @@ class PoseEstimatorConfig:
     channels: Count = 32
     """Feature maps; each of their cells covers 4 x 4 pixels."""
     dilations: tuple[Count, ...] = (1, 2, 4)
-    """Dilation of each further layer, cells. Together they cover the largest object, or its shape,
-    and so its height, cannot be estimated."""
+    """Dilation of each further layer, cells. Together they must cover the largest object: its shape
+    shows its height."""
     keypoints: Count = 16
     """Keypoints of each image, found by a spatial softmax."""
     keypoint_features: Count = 32

@@ -37,20 +37,19 @@ class PolicyConfig:
 
     touch_dim: int  # of the frozen embedding of both fingertips together; 0 without touch
     touch: str  # names what made the embeddings: encoder, sensor, background
-    # "wrench": a small network, trained on the simulator's pad forces and on nothing else
-    # (TacBench's T1), reads the wrenches on both pads from the embedding, and the head gets those
-    # 12 numbers. "embedding": a projection that is trained on the actions alone, for episodes
-    # without that truth
+    # "wrench": a small network, trained only on the simulator's pad forces (TacBench's T1), reads
+    # the wrenches on both pads from the embedding; the head gets those 12 numbers. "embedding": a
+    # projection that is trained on the actions alone, for episodes without that truth
     touch_input: TouchInput = "wrench"
     touch_projection_dim: int = 64  # width of the projection, with "embedding"
     # standard deviation of noise on normalised embeddings in training. Without it the network
     # recognises each recorded episode by its sensors
     touch_noise: float = 0.1
-    # likewise on joint and TCP positions, one draw for all ticks observed, so that the place on the
-    # table does not tell how a wire goes on. "body_twist" reads no positions
+    # likewise on joint and TCP positions, the same for all observed ticks, so that the network
+    # cannot infer a wire's course from its place on the table. "body_twist" reads no positions
     position_noise: float = 0.3
-    # m, the only two that the demonstrations command; what is predicted in between becomes the
-    # nearer one, for the hand would go to a width on the way. Empty: any width
+    # m, the only widths that the demonstrations command. A predicted width becomes the nearest of
+    # them, because the hand would stop at one in between. Empty: any width
     gripper_widths: tuple[float, ...] = ()
     end_to_end: EndToEndConfig | None = None  # touch encoder that is trained jointly; None without
     # columns of `features.FEATURES`, the state first. Columns that only a simulator knows come from

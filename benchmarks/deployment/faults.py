@@ -54,10 +54,10 @@ class Config(BenchmarkOptions):
     faults: tuple[str, ...] = ()
     """Names of faults to try, as the table has them; default: all."""
     lock_step: bool = True
-    """Simulated time waits for the client: for a machine that is busy."""
+    """Let simulated time wait for the client, so that a busy machine does not matter."""
 
 
-_TIMEOUT = 300.0  # s for anything to happen, on a machine however loaded
+_TIMEOUT = 300.0  # s to wait for any event, on a loaded machine, too
 _IN_THE_AIR = 0.08  # m: height of an object that is carried
 _UNLIMITED = resource.RLIM_INFINITY
 _FORKSERVER = multiprocessing.get_context("forkserver")  # one import of everything serves every row
@@ -73,7 +73,7 @@ class FaultCase:
     policy: str = "expert"
     kills: bool = False
     full: bool = False
-    carrying: bool = False  # it comes once the object is in the air, not as soon as the arm moves
+    carrying: bool = False  # fault once the object is in the air, not as soon as the arm moves
 
 
 CASES = (
@@ -109,9 +109,9 @@ CASES = (
 class FaultRow:
     """What one fault did.
 
-    `rest` is not a number if the fault stops no arm, or takes the controller, and so the twin, away.
-    `episodes_whole` tells whether all is on disk and whole that had been finished, this run's episode
-    included unless its process or its disk was what failed.
+    `rest` is NaN if the fault does not stop the arm, or ends the twin. `episodes_whole` tells whether
+    all finished episodes are whole on disk; this run's counts unless its process was killed or its
+    disk was full.
     """
 
     name: str
@@ -121,11 +121,11 @@ class FaultRow:
     speed: float  # share of the maker's joint speed
     force: float  # N, the most that pressed on the robot from outside
     episodes_whole: bool
-    late: float  # ms by which 99 % of the ticks were late at most
+    late: float  # 99th percentile of the ticks' lateness, ms
 
 
 def run(config: Config) -> dict[str, Any]:
-    """The table and its numbers."""
+    """Return the table and its numbers."""
     names = [case.name for case in CASES]
     if unknown := [name for name in config.faults if name not in names]:
         raise UserError(f"there is no fault {unknown[0]!r}; there are: {', '.join(names)}")
@@ -166,7 +166,7 @@ def _run(case: FaultCase, folder: Path, lock_step: bool, number: int) -> FaultRo
     stops = message != PLAN_ENDED and (case.kills or case.control_line or broken_at.exists())
     rest = after["time"] - after["rest"] - before if after and stops else float("nan")
     finished = 1 if case.kills or case.full else 2
-    # What an interrupted episode left behind belongs to none.
+    # Files of an interrupted episode belong to no episode: not damage.
     damaged = any("belongs to no episode" not in line for line in validate(episodes))
     whole = len(EpisodeSet(episodes)) == finished and not damaged
     return FaultRow(case.name, message, rest, **worst, episodes_whole=whole, late=float(late))
@@ -175,7 +175,7 @@ def _run(case: FaultCase, folder: Path, lock_step: bool, number: int) -> FaultRo
 def _inject(
     case: FaultCase, cell: CellConfig, deploy: ForkServerProcess, report: Path
 ) -> tuple[float, dict[str, Any] | None]:
-    """Break it while the arm moves; the twin's time then, and its truth once the arm rests."""
+    """Inject the fault while the arm moves; return its time, and the truth once the arm rests."""
     port = cell.task.twin
     truth = partial(ask_twin, port, "truth")
 
@@ -200,7 +200,7 @@ def _inject(
 
 
 def _serve(host: str, folder: Path, lock_step: bool) -> None:
-    """The twin's process."""
+    """Run the twin, in its own process."""
     task = PickPlaceConfig(cameras=("front",), objects=("wooden_block",))
     twin = Twin(TwinConfig(task, "fr3", 3, host, 0, lock_step, folder))
     write_file(folder / "cell.json", json.dumps(cell_table(twin.cell_config)).encode())
@@ -210,7 +210,7 @@ def _serve(host: str, folder: Path, lock_step: bool) -> None:
 def _deploy(
     cell: CellConfig, case: FaultCase, episodes: Path, report: Path, broken_at: Path
 ) -> None:
-    """The deployment's process; a first, short episode is there before the fault comes."""
+    """Run the deployment in its own process, with a first, short episode before the fault."""
     connection = connect_cell(cell, ft.CONTROL_HZ)
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     truth = connection.truth
@@ -266,7 +266,7 @@ class BrokenPolicy(Actor):
         self._ticks += 1
         n, width = self._loop.commanded().size, self._loop.width
         step = np.zeros(n)
-        joint = -1 if self._how == "outwards" else 0  # the wrist's end comes before the workspace's
+        joint = -1 if self._how == "outwards" else 0  # the wrist meets its limit before the box's
         step[joint] = 0.0 if self._how == "still" else 0.02
         if self._how == "nan" and self._ticks > ft.CONTROL_HZ:
             step[0] = np.nan
@@ -287,10 +287,10 @@ class HangingPlanner:
         self._width, self._mark_broken, self._plans = width, mark_broken, 0
 
     def embed(self, observations: Sequence[Observation]) -> None:
-        """Nothing is embedded ahead."""
+        """Do nothing: no work is done ahead."""
 
     def plan(self, observations: Sequence[Observation]) -> np.ndarray:
-        """Three plans, then none."""
+        """Return three plans, then hang."""
         self._plans += 1
         if self._plans > 3:
             self._mark_broken()

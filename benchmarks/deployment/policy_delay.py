@@ -1,6 +1,6 @@
 """Success in the environment under late observations, plans and commands, or by cause.
 
-The arm is as deployed otherwise. By cause: each part of `--env.as-deployed` alone, and all but it.
+The arm is as deployed otherwise. By cause: each part of `--env.as-deployed` alone, and all the others.
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ class Config(TrialOptions):
     task: TaskName = "pick-place"
     """Task; for the maze, on validation wires."""
     causes: bool = False
-    """Run an ablation instead of delays: each effect of a deployment alone, then all but it."""
+    """Run an ablation instead of delays: each effect of a deployment alone, then all the others."""
     delay: tuple[NotNegative, ...] = (0.0, 50.0, 100.0, 150.0)
     """Delay from sensing to command, ms, half before the policy, half after; planning adds a tick."""
     jitter: tuple[NotNegative, ...] = (0.0, 50.0)

@@ -33,7 +33,7 @@ class Config(BenchmarkOptions):
     """Options of benchmark replay."""
 
     episodes: Count = 3
-    """Seeds; each waves and presses."""
+    """Number of seeds; each gives a wave and a press."""
     seed: Seed = seeds.REPLAY.start
     """First random seed."""
 

@@ -24,7 +24,7 @@ class Config(BenchmarkOptions):
     seconds: Positive = 3600.0
     """Simulated seconds of motion over both arms at 20, 50 and 125 Hz; an hour takes 8 minutes."""
     seed: Seed = 0
-    """Random seed of the policy's wishes."""
+    """Random seed of the policy's actions."""
 
 
 Joints = Float[np.ndarray, " n"]

@@ -1,7 +1,7 @@
 """Bead maze: success on unseen wires, and errors along recorded ones (TacBench T5, Sparsh Table 10).
 
-Policies of one recipe count as one arm, its training seeds as repeats. All arms get the same wires
-and starts. The open-loop part is in `policies/evaluation/open_loop.py`.
+Policies of one recipe count as one group, its training seeds as repeats. All groups get the same
+wires and starts. The open-loop part is in `policies/evaluation/open_loop.py`.
 """
 
 import tempfile

@@ -55,7 +55,7 @@ def find_embedder(name: str, seed: int) -> Embedder:
         return _of_pictures(lambda batch: network.features(imagenet_pixels(batch)))
     if name.startswith("random:"):
         return untrained(name.removeprefix("random:"), seed).embed_frames
-    # Names on Hugging Face are OWNER/MODEL; ours are plain, and a folder says what it holds.
+    # Names on Hugging Face are OWNER/MODEL; ours have no slash, or are folders.
     foreign = (Path(name) / "config.json").is_file() or ("/" in name and not Path(name).exists())
     if foreign and find_published(name) is None:
         return _hugging_face(name)

@@ -37,12 +37,12 @@ class Config(BenchmarkOptions):
 
 RANGE = 25.0
 """Largest force that is judged, N."""
-_PRESSED = 0.5  # N
-_FIRST = 5  # frames, untouched
+_PRESSED = 0.5  # N that count as contact
+_FIRST = 5  # untouched frames at the start
 _LASTING = 3  # frames that a fall of the cost must last
-_FALLEN = 0.05  # of the whole fall
-_NEAR = 3  # frames
-_STEADY = 0.2  # N
+_FALLEN = 0.05  # share of the whole fall that counts as its start
+_NEAR = 3  # frames between force and fall of the cost that count as close
+_STEADY = 0.2  # N, range of the first frames' force if the hand is open
 _IMPOSSIBLE = 60.0  # N, a spike of the load cell: the hand cannot do that
 
 
@@ -61,7 +61,8 @@ def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> di
     for grasp in track(grasps, "reading", "grasp"):
         frames = grasp.frames()
         force = grasp.force[: len(frames)]
-        # With a steady load cell the hand is open and shows its offset; otherwise it is closing already.
+        # A steady load cell means an open hand, and shows its offset; otherwise the hand is already
+        # closing.
         open_hand = float(np.ptp(force[:_FIRST])) < _STEADY
         if open_hand:
             force = force - np.median(force[:_FIRST])

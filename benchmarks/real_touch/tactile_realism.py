@@ -44,12 +44,12 @@ class Config(BenchmarkOptions):
 
 N_TEST_PRESSES = {"gelsight": 12, "gelsight_mini": 6}
 MAIN_METHOD = "ours, circles corrected"
-# Ball radius (m) and contact share at which Taxim does best on the fitted presses, of 1 to 4 mm and
-# both shares: for circles as labelled, and as registered.
+# Ball radius (m) and contact share at which Taxim does best on the fitted presses, among 1 to 4 mm
+# and 0 or 0.4: for circles as labelled, and as moved.
 _TAXIM_LABELLED = {"gelsight": (2e-3, 0.4), "gelsight_mini": (3e-3, 0.0)}
 _TAXIM_MOVED = {"gelsight": (2e-3, 0.4), "gelsight_mini": (1e-3, 0.4)}
-_LEGEND = """corrected: labels put through the line that the fitted presses show between label and contact,
-the held-out picture unseen; moved: registered against the held-out picture itself"""
+_LEGEND = """corrected: labels corrected by a line fitted to the fitted presses, without the held-out
+picture; moved: circles fitted to the held-out picture"""
 _CUT = 120, 160  # rows and columns of the examples in the picture
 _EXAMPLES_PER_SENSOR = 2  # of each sensor
 

@@ -70,8 +70,8 @@ class TaximRenderer:
     ) -> Float32[np.ndarray, "h w 3"]:
         """Render one press: circle of contact (px), radius (m).
 
-        The share of the deepest overlap counts as contact; 0: the circle where the ball cuts the
-        flat gel; 0.4: where taxim's own gel model clings to it.
+        `contact_share` is the share of the deepest overlap at the circle: 0 where the ball cuts the
+        flat gel, 0.4 where taxim's gel model comes loose from it.
         """
         return self._picture(_ball_height(circle, ball_radius, contact_share))
 

@@ -163,7 +163,7 @@ def _by_property(values: Iterable[float]) -> dict[str, float]:
 def light_shift(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> dict[str, float]:
     """Return shifts of the embedding under 10 % more light and under touch.
 
-    The lightest touch is the 5 % quantile: a few clips are touched from their first frame on.
+    The lightest touch is the 5 % quantile, because a few clips have no untouched frame.
     """
     moved, touched = [], []
     for touch, own in zip(touches, embedded, strict=True):

@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 
 def align_touch(config: "Align") -> None:
-    """Align a touch encoder on episodes, touches of the wand or annotations; check them before."""
+    """Check episodes, touches of the wand or annotations, and align a touch encoder on them."""
     check_training(config, config.out)
     if config.data.suffix != ".jsonl" and is_wand_set(config.data):
         _align_wand(config)
         return
     if config.validation is None:
-        raise UserError("only touches of the wand hold some out by themselves: give --validation")
+        raise UserError("only touches of the wand are split automatically: give --validation")
     if config.data.suffix == ".jsonl":
         _align_annotated(config, config.validation)
         return

@@ -34,7 +34,7 @@ def parse(
 ) -> Any:
     """Parse the arguments after a command's name into its Config, or that of a subcommand.
 
-    A Config with an option `--preset` has the defaults of each of its values in `PRESETS`. A
+    If a Config has an option `--preset`, its `PRESETS` hold the defaults for each value. A
     command with `--task` has each task's default environment options; `--env.*` are those of the
     typed task. UserError: a value is out of range. SystemExit: help was asked for (0), or an
     argument was not understood (2).
@@ -90,7 +90,7 @@ def _as_options(
         kinds = [get_origin(kind) for kind in (_bare(annotation), *get_args(_bare(annotation)))]
         if tyro.conf.Positional in getattr(annotation, "__metadata__", ()) and Literal not in kinds:
             offered = Annotated[offered, tyro.conf.arg(metavar=field.name.upper())]
-        if default is None or default == ():  # the text describes what that means
+        if default is None or default == ():  # the help text says what an empty default means
             hint = "(default: runs/<date>_<command>)" if field.name == "out" else ""
             offered = Annotated[offered, tyro.conf.arg(help_behavior_hint=hint)]
         fields.append(StructFieldSpec(field.name, offered, default, text))

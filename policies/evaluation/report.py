@@ -22,8 +22,8 @@ TRIALS, METRICS = "trials.jsonl", "metrics.json"
 def record_trials(out: Path, trials: Iterator[Trial], count: int) -> list[Trial]:
     """Write each trial as it ends, then the metrics; print the table.
 
-    After Ctrl-C those of the `count` trials that have ended are reported, and the interruption goes
-    on.
+    After Ctrl-C the finished ones of `count` trials are reported, and the interruption is raised
+    again.
     """
     ended: list[Trial] = []
     try:
@@ -66,7 +66,7 @@ def film_trials(
 
 
 def _film(task: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec, path: Path) -> None:
-    env = make_env(task)  # with other images it would draw other random numbers
+    env = make_env(task)  # with the same images, because rendering them draws random numbers
     episode, images = record_with_film(env, spec, policy, meshes="fast")
     write_film(path, images, episode, task.control_hz)
     env.close()

@@ -105,6 +105,6 @@ def masked_mean(
     if is_pad is None:
         return error.mean()
     valid = ~is_pad[..., None]
-    # A process averages over its rows: what it divides by must be the same in all.
+    # Each process sums over its own rows, so all must divide by the same count.
     count = gather_batch(valid.sum()[None]).float().mean()
     return (error * valid).sum() / (count * error.shape[-1]).clamp(min=1)

@@ -13,7 +13,8 @@ from torch import Tensor
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.config import SamplerConfig
 
-FLOW_TIME_SCALE = 100.0  # the network's step at flow time 1, so that its embedding resolves it
+# the network's step at flow time 1: its step embedding cannot resolve 0 to 1
+FLOW_TIME_SCALE = 100.0
 DenoisingNetwork = Callable[[Float[Tensor, "b h a"], Float[Tensor, " b"]], Float[Tensor, "b h a"]]
 
 

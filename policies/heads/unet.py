@@ -38,7 +38,7 @@ class UNetConfig:
 
 PRESETS: dict[str, UNetConfig] = {
     "tiny": UNetConfig((16, 32), groups=4, step_embedding_dim=16),
-    # plans on one core within a tick of 20 Hz; two levels, for calls cost more than channels
+    # plans on one core within a tick of 20 Hz; two levels, because calls cost more than channels
     "small": UNetConfig((96, 192), kernel=3, step_embedding_dim=64),
     # diffusion_policy's config for states; its 512-1024-2048 for images differs in width alone
     "published": UNetConfig((256, 512, 1024), step_embedding_dim=256),
@@ -73,7 +73,7 @@ class UNet(nn.Module):
             nn.ConvTranspose1d(n, n, 4, 2, 1) for n in reversed(widths[:-1])
         )
         self._sizes = [2 * m.out_channels for m in self.modules() if isinstance(m, ResidualBlock)]
-        # one matrix for all blocks: the same numbers as one a block, with fewer calls
+        # one matrix for all blocks: the same result as one per block, with fewer calls
         self.film = nn.Sequential(nn.Mish(), nn.Linear(condition_dim + w, sum(self._sizes)))
         self.out = nn.Sequential(
             _convolution(widths[0], widths[0], config.kernel, config.groups),

@@ -52,8 +52,8 @@ class TouchEmbedder:
     ) -> Float32[np.ndarray, " e"]:
         """Embed the latest of the last `1 + reach` ticks, with the same result as `embed`.
 
-        If there are fewer, the oldest is repeated. Frames of an object that was passed before are
-        not preprocessed again.
+        If there are fewer, the oldest is repeated. Frame objects passed in an earlier call are not
+        preprocessed again.
         """
         sides = [
             self._recent[key].latest([tick[key] for tick in observations], untouched[key])

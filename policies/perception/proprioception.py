@@ -5,7 +5,7 @@ velocity and the vertical, without place or heading, so that what is learned on 
 every wire that bends as much.
 
 With `observation.command` among the columns the commanded arm stands in for the measured one:
-delays and the arm's lag then do not change the input, and no correction is made twice.
+delays and the arm's lag then do not change the input, and the policy does not repeat a correction.
 """
 
 import numpy as np

@@ -88,7 +88,7 @@ class StateEstimator:
             tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
             self._start = first, self.network.pose_estimator(pictures, tcp)[0].numpy()
         touch = torch.from_numpy(self.touch.embed_tick([observation], first))[None]
-        # 0 or 1, as in training: on a probability the policy stands still at times
+        # 0 or 1, as in training: given probabilities, the policy sometimes stands still
         contact = (self.network.contact(touch)[0] > 0).numpy().astype(np.float32)
         return {ft.TRUTH_CONTACT: contact, ft.TRUTH_START: self._start[1]}
 

@@ -1,4 +1,4 @@
-"""Choice of the best snapshot of a training by trials in the task, since a loss cannot tell."""
+"""Choice of a training's best snapshot by trials in the task, because the loss does not show it."""
 
 import shutil
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ def select(
 ) -> dict[str, Score]:
     """Try every snapshot of a run on validation tasks, and make the best one its policy.
 
-    What goes beside every policy is in `parts`, see `add_parts`. Returns the score of every
+    `parts` are the folders beside every policy, see `add_parts`. Returns the score of every
     snapshot; among equals the later one wins.
     """
     scores: dict[str, Score] = {}

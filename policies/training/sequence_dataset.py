@@ -43,7 +43,7 @@ def load_recordings(
     workers: int = 1,
     skip: Sequence[int] | None = None,
 ) -> Recordings:
-    """Read episodes, and embed those that are not yet; a kill loses those in progress.
+    """Read episodes, and embed those that have no embedding yet; a kill loses those in progress.
 
     At the start of each chosen episode `skip` ticks are left out; images and forces stay relative
     to its very first tick. UserError: nothing chosen, a missing column, another rate or embedder

@@ -86,9 +86,9 @@ def report_pauses(pauses: Sequence[int], fps: int, trimmed: bool) -> None:
 
 
 def find_task(chosen: Sequence[tuple[EpisodeSet, Sequence[int]]], task: str | None) -> TaskName:
-    """Return the task of the chosen episodes, which is to be the one asked for, if one is.
+    """Return the task of the chosen episodes; it must be `task` if that is given.
 
-    UserError: they are of several tasks or of another one, or name none and none is asked for.
+    UserError: they are of several tasks or of another one, or name none and `task` is None.
     """
     root, found = chosen[0][0].root, _common("task", chosen, task_of)
     if task and found not in ("", task):

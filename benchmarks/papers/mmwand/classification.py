@@ -46,12 +46,12 @@ class Config(BenchmarkOptions):
     """Options of benchmark classification."""
 
     data: Path = field(kw_only=True)
-    """Touches recorded by `collect-touches --body wand`, or vt60's folder (real touches of a dome, with
-    which come networks of their own: of the other options only `cache` and `seed` count)."""
+    """Touches recorded by `collect-touches --body wand`, or vt60's folder (real touches of a dome; it
+    uses its own networks and, of the options below, only `cache` and `seed`)."""
     encoders: tuple[str, ...] = ("gelsight_mini_surfaces", "gelsight_mini", "random:gelsight_mini")
     """Touch encoders: see benchmark real-touch."""
     splits: tuple[Literal["sample", "press"], ...] = ("sample", "press")
-    """What is held out; with whole objects held out there is nothing to name."""
+    """Units held out; whole objects cannot be, because an unseen object has no name to find."""
     seeds: Count = 3
     """Splits of each kind."""
     fine_tuned: tuple[Network, ...] = ()

@@ -104,7 +104,7 @@ def _tensor(pictures: Pictures) -> Float[Tensor, "n 3 h w"]:
 def _shifted(
     batch: Float[Tensor, "n 3 h w"], generator: torch.Generator
 ) -> Float[Tensor, "n 3 h w"]:
-    """Shift a batch by up to 8 px; no flips, for each colour comes from a side of the gel."""
+    """Shift a batch by up to 8 px; no flips, because each colour comes from one side of the gel."""
     dy, dx = torch.randint(-8, 9, (2,), generator=generator).tolist()
     return torch.roll(batch, (dy, dx), (2, 3))
 

@@ -1,9 +1,9 @@
 """Cross-modal retrieval on wand touches: MMWand's Table IV, on four splits.
 
 Every query ranks all candidates of the other modality by cosine; candidates of the same object are
-right. A touch and the picture taken with it are never matched. Frozen embeddings are joined by
-linear heads that are fitted on the training touches, for every encoder alike; `--trained` adds touch
-backbones that are trained on the same touches, as in the paper.
+right. A touch and the picture taken with it are never matched. For every encoder, linear heads
+fitted on the training touches map images and sentences to its frozen embeddings; `--trained` adds
+touch backbones that are trained on the same touches, as in the paper.
 """
 
 from dataclasses import field, replace
@@ -49,12 +49,12 @@ class Config(BenchmarkOptions):
     """Options of benchmark retrieval."""
 
     data: Path = field(kw_only=True)
-    """Touches recorded by `collect-touches --body wand`, or vt60's folder (real touches of a dome, with
-    which come networks of their own: of the other options only `cache` and `seed` count)."""
+    """Touches recorded by `collect-touches --body wand`, or vt60's folder (real touches of a dome; it
+    uses its own networks and, of the options below, only `cache` and `seed`)."""
     encoders: tuple[str, ...] = ("gelsight_mini_surfaces", "gelsight_mini", "random:gelsight_mini")
     """Touch encoders: see benchmark real-touch."""
     splits: tuple[Split, ...] = SPLITS
-    """What is held out."""
+    """Units held out: single touches (sample), visits (press), objects or sentences."""
     seeds: Count = 3
     """Splits and heads of each kind, each with another seed."""
     heads: HeadsConfig = HeadsConfig()
@@ -139,11 +139,11 @@ def _trained(
 
 
 def judge(data: EmbeddedSet, fold: Fold, embedded: dict[str, Float[np.ndarray, "_ d"]]) -> Found:
-    """Judge all directions between what is embedded; a query without a right candidate is not asked.
+    """Judge all directions between modalities; queries without a right candidate are skipped.
 
     Args:
         data: the set.
-        fold: which of it is judged.
+        fold: the split to judge.
         embedded: unit vectors of one space: of the test touches, their pictures, the test sentences;
             two of them or all three.
     """
@@ -175,7 +175,7 @@ def judge(data: EmbeddedSet, fold: Fold, embedded: dict[str, Float[np.ndarray, "
 
 
 def _nearest_in_pixels(data: EmbeddedSet, fold: Fold, seed: int) -> Found:
-    """Let the nearest training touch in raw pixels stand for a touch, with its picture and sentences."""
+    """Represent a touch by the picture and sentences of the nearest training touch in raw pixels."""
     pixels, image, texts = (_unit(a) for a in (data.pixels, data.image.mean(1), data.texts))
     nearest = fold.train[(pixels[fold.test] @ pixels[fold.train].T).argmax(1)]
     own = data.describes[data.label[nearest]] & fold.train_text
@@ -196,7 +196,7 @@ def _unit(x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
 
 
 def _summary(found: list[Found]) -> dict[str, Interval]:
-    """Return mAP by direction over all seeds; none where no object has two touches to find each other."""
+    """Return mAP by direction over all seeds, without directions that have no queries."""
     summary = {}
     for direction in found[0]:
         objects, value = (

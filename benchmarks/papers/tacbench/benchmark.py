@@ -43,7 +43,7 @@ Reading = Callable[[Preprocessor], data.RigFrames]
 
 @dataclass(frozen=True)
 class Bench:
-    """What all trainings share."""
+    """Arguments that all trainings share."""
 
     config: Config
     sensor: str

@@ -49,7 +49,7 @@ class RigFrames:
     def stacked(self, rows: Rows, offsets: tuple[int, ...]) -> Float[Tensor, "k t 3 h w"]:
         """Return frames and those before each; a stroke's first frames repeat its first.
 
-        For grasps, whose moments are seconds apart, `STRIDE` frames are one moment.
+        For grasps, whose moments are seconds apart, an offset of `STRIDE` is the moment before.
         """
         newest = rows.numpy()
         first = np.searchsorted(self.stroke, self.stroke[newest])

@@ -29,7 +29,7 @@ class PoseTask:
         self.classes = torch.stack([_classes(change[:, k], bins[k]) for k in range(3)], 1)
         train = self.classes[self.split.train]
         self._known = [torch.bincount(train[:, k], minlength=CLASSES) for k in range(3)]
-        least = len(train) / 100  # rare classes weigh more, but none more than a hundredth would
+        least = len(train) / 100  # rare classes weigh more, at most as a class of 1 % of the pairs
         self._weights = [len(train) / CLASSES / n.clamp(min=least) for n in self._known]
 
     def probe(self, features: int, grid: tuple[int, int]) -> nn.Module:

@@ -28,7 +28,7 @@ from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.runtime.progress import track
 
 END_TO_END, RANDOM = "end-to-end:", "random:"
-_SNAPSHOTS = 8  # of a training; the best on validation frames wins
+_SNAPSHOTS = 8  # snapshots of a training; the best on validation frames is kept
 _MAX_VALIDATION = 160  # frames, evenly drawn
 _WEIGHT_DECAY = 0.05
 

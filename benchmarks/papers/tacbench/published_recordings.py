@@ -1,7 +1,7 @@
 """Published recordings as samples of TacBench: force and slip, pose, grasps.
 
-A recording is what the publisher made in one go: a stroke, a bag, a grasp. Of long ones the middle is
-read.
+A recording is what the publisher made in one go: a stroke, a bag, a grasp. Only the middle of a long
+recording is read.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
@@ -65,7 +65,7 @@ def find_published(folder: Path, sensor: str) -> Published | None:
 def read_published_strokes(
     folder: Path, sensor: str, count: int, preprocess: Preprocessor
 ) -> RigFrames:
-    """Read about that many strokes, as many of each probe; uses are as in the simulation."""
+    """Read about that many strokes, as many of each probe, split as in simulation."""
     chosen = _evenly(list(read_strokes(folder, sensor)), lambda stroke: stroke.probe, count)
     touch, force, slip = [], [], []
     for stroke in track(chosen, "strokes", "stroke"):
@@ -82,8 +82,8 @@ def read_published_strokes(
 def read_published_bags(folder: Path, count: int, preprocess: Preprocessor) -> RigFrames:
     """Read about that many bags of the ring finger; test bags are the published ones.
 
-    Forces are unknown there. The object always touches, entered as 1 N into the gel. The first `STRIDE`
-    frames of a bag have no motion and count as untouched.
+    Forces are unknown; since the object always touches, 1 N into the gel stands for contact. The first
+    `STRIDE` frames of a bag have no motion and count as untouched.
     """
     chosen = _evenly(list(read_bags(folder)), lambda bag: (bag.object, bag.held_out), count)
     touch, force, pose = [], [], []

@@ -33,10 +33,11 @@ SHIPPED, RANDOM, PIXELS, OUTSIDE = (
     "pixels outside the sensor",
 )
 INPUTS = (SHIPPED, RANDOM, PIXELS, OUTSIDE)
-"""Touch embeddings. The last cannot feel anything: what it finds is the light of the session."""
+"""Touch embeddings. The last has no touch in it: what it finds comes from the session's light."""
 DomeSplit = Literal["press", "object"]
 
-_SIDE, _BATCH, _CONTRAST = 192, 32, 2.0  # px and pictures of the network, counts a count of change
+# network input: side, px; batch size; counts per count of change
+_SIDE, _BATCH, _CONTRAST = 192, 32, 2.0
 _SMALL = 28  # px of the pictures that pixels are compared in
 
 
@@ -80,7 +81,7 @@ def embed_dome(folder: Path, seed: int, cache: Path) -> DomeSet:
 
 def folds(data: DomeTouches, split: DomeSplit, seed: int) -> Iterator[DomeFold]:
     """Yield four folds. "press": a quarter of every object's touches and views, at random; "object":
-    a quarter of every class's objects with all that is theirs.
+    a quarter of every class's objects with all their touches and views.
     """
     rng = np.random.default_rng([seed, 13])
     if split == "press":

@@ -88,7 +88,7 @@ def _retrieve(data: DomeSet, name: str, split: DomeSplit, seed: int) -> dict[str
 
 
 def _nearest_touch(data: DomeSet, fold: DomeFold) -> Float[np.ndarray, "b d"]:
-    """Return cosines to the test views of the mean view of the nearest training touch's object."""
+    """Return cosines of test views to the mean view of the nearest training touch's object."""
     listed, pixels = data.listed, _unit(data.touch[PIXELS])
     found = (pixels[fold.test_touch] @ pixels[fold.train_touch].T).argmax(1)
     mean = np.zeros((len(listed.names), data.image.shape[1]), np.float32)
