@@ -20,7 +20,7 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import stop_on_request
 
 _POLL_INTERVAL = 0.004  # s between looks for a new picture
-_WIDTH = 100  # of the terminal's line
+_WIDTH = 100  # characters of the terminal's line
 
 
 def record_real_touches(

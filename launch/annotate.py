@@ -11,7 +11,7 @@ from touchgoal.runtime.option_types import checked_dataclass
 
 @checked_dataclass
 class _Source:
-    """What to annotate, and with which networks."""
+    """Recordings to annotate, and networks to use."""
 
     source: Annotated[Path, tyro.conf.Positional]
     """List of VisGel, such as data_lst/train_touch2vision.txt."""

@@ -38,7 +38,7 @@ class Config:
     """Outcomes to ask the expert for; pick-place has poor successes and failures on purpose, too. An
     episode that ends otherwise is recorded with outcome `not_` and the name."""
     feedback: bool = False
-    """pick-place: the expert plans anew at every tick; policies learn better from that."""
+    """pick-place: the expert reacts to every tick's state; policies learn better from that."""
     policy: str | None = None
     """Policy that acts while the expert's actions are recorded (DAgger), named as for run-policy."""
     seed: Seed = 0

@@ -33,7 +33,8 @@ class Config:
     """Touch encoder: a name (touchgoal list encoders), a folder, or a published Sparsh one. Default:
     the one that ships for the episodes' sensor. Sentences need one that is aligned with texts."""
     towers: str | None = None
-    """Image and text networks: offline, or a CLIP (Hugging Face id or folder). If given without --encoder, only images are measured."""
+    """Image and text networks: offline, or a CLIP (Hugging Face id or folder). If given
+    without --encoder, only images are measured."""
     assume_success: bool = False
     """Take episodes without a recorded outcome as successes."""
     seed: Seed = 0

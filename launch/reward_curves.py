@@ -6,7 +6,7 @@ applies to it. The cost is the distance to the goal; rewards are -cost, and gamm
 Phi = -cost (Ng et al. 1999).
 
 What is broken is skipped and listed in skipped.csv; the exit status is 1 only if nothing could be
-measured. The same line with the same --out goes on where an interrupted run stopped.
+measured. The same command with the same --out continues an interrupted run.
 """
 
 from dataclasses import replace

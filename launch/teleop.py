@@ -98,8 +98,8 @@ def _record_attempt(
             return None
         hand.press(keys)
         progress, force = tick[ft.TRUTH_PROGRESS][0], np.linalg.norm(tick[ft.WRENCH][:3])
-        felt = f"{progress:4.0%} of the way  {force:4.1f} N on the hand"
-        _show(f"{felt}  {hand.held or 'still':<6}{HELP}")
+        status = f"{progress:4.0%} of the way  {force:4.1f} N on the hand"
+        _show(f"{status}  {hand.held or 'still':<6}{HELP}")
         now = time.monotonic()
         due = max(due + 1 / env.config.control_hz, now)  # lost time is not made up for
         time.sleep(due - now)

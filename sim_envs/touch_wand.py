@@ -27,7 +27,7 @@ from touchgoal.sim_envs.wand.bench import VIEWS, Bench
 from touchgoal.sim_envs.wand.objects import WandObject, find_wand_object, wand_objects
 
 _AWAY = 0.09  # m from the surface, before contact
-_LOWEST = np.radians(12)  # of the approach over the bench, rad
+_LOWEST = np.radians(12)  # rad, lowest elevation of the approach over the bench
 _TILT = 0.2  # how far the wand leans from the surface's normal towards its approach
 _GRAZING = 0.3  # cosine between normal and approach below which the wand would slide off
 _FEELER = 0.5  # N of the light touch that finds the object's place on the gel
@@ -47,7 +47,7 @@ class TouchWandConfig:
     views: bool = True
     """Render the four cameras."""
     gel: Seed = 0
-    """Which sensor instance is on the wand; another number is another gel."""
+    """Number of the sensor instance on the wand; another number is another gel."""
 
 
 @dataclass(frozen=True, eq=False)

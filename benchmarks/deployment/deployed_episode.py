@@ -42,7 +42,7 @@ class Deployment:
     success: bool
     progress: float | None  # of the task at the end, in [0, 1]; None if unknown
     ending: str
-    phase: str  # of the fingers at the end
+    phase: str  # phase of the grasp at the end, by the fingers
     seconds: float
     peak_force: float  # external, on the hand, N
     clamped: dict[str, float]  # share of the ticks in which each limit changed the command

@@ -107,7 +107,7 @@ CASES = (
 
 @dataclass(frozen=True)
 class FaultRow:
-    """What one fault did.
+    """Effect of one fault.
 
     `rest` is NaN if the fault does not stop the arm, or ends the twin. `episodes_whole` tells whether
     all finished episodes are whole on disk; this run's counts unless its process was killed or its

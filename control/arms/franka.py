@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 RATE = 200.0  # Hz of velocity commands
 STATE_TIMEOUT = 0.5  # s; libfranka itself gives up after 1 s
-_COMMAND_MS = 100  # of each
+_COMMAND_MS = 100  # duration of each command
 _POSITION_GAIN = 10.0  # 1/s towards the commanded position
-_SHARE = 0.9  # of franky's limits that the stream uses; the rest is for the pull
+_SHARE = 0.9  # share of franky's limits for the stream; the rest is for the pull
 # Nm and N: franky's defaults for libfranka's setCollisionBehavior, above RobotLimits.force.
 _TORQUE_REFLEX, _FORCE_REFLEX = 20.0, 30.0
 
@@ -70,7 +70,7 @@ class FrankaClient(ArmClient):
     def _measure(self) -> ArmReading:
         robot = self._require()
         try:
-            robot.poll_motion()  # raises what ended a motion
+            robot.poll_motion()  # raises the error that ended a motion
         except self._franky.ControlException as error:
             self._aborted = " ".join(str(error).split())
         state = robot.state

@@ -17,7 +17,7 @@ from touchgoal.control.motion.kinematics import Kinematics
 
 RATE = 125.0  # Hz of servoJ; 20 to 500
 STATE_TIMEOUT = 0.05  # s
-_GAIN = 300.0  # of servoJ, 100 to 2000; URScript's default
+_GAIN = 300.0  # servoJ's gain, 100 to 2000; URScript's default
 _LOOKAHEAD = 0.03, 0.2  # s, servoJ's range; the arm lags by about this much
 _BRAKING = 10.0  # rad/s^2 of servoStop; ur-rtde's default
 _UNLOCKING = 2.0  # s that clearing a protective stop may take
@@ -63,7 +63,7 @@ class UrClient(ArmClient):
         self._commanded = np.array(receive.getTargetQ())
         tcp, _ = self._kinematics.forward(q)
         # Forces "acting on the end point of the TCP" (UR about get_tcp_force), about the controller's
-        # own TCP, in its base frame, the payload's weight taken off.
+        # own TCP, in its base frame, without the payload's weight.
         wrench = np.array(receive.getActualTCPForce())
         wrench = shift_wrench(wrench, np.array(receive.getActualTCPPose()[:3]), tcp)
         reading = ArmReading(

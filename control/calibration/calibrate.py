@@ -41,9 +41,9 @@ class FittedCalibration:
 
     calibration: SensorCalibration  # the sensor file
     circles: Circles  # of the fitted presses, moved to their pictures, px
-    # of the fitted presses, m; where unknown, fitted, which pictures determine poorly
+    # of the fitted presses, m; unknown ones are fitted, but pictures determine them poorly
     ball_radius: Float[np.ndarray, " n"]
-    varies_over_image: bool  # of the response; not if all presses lie in one place
+    varies_over_image: bool  # whether the response does; not if all presses lie in one place
     # label_offset, label_slope: true centre x, centre y and radius (px) are about offset + slope x
     # label
     label_offset: Circle

@@ -13,7 +13,7 @@ from touchgoal.control.tactile.background import Drift
 from touchgoal.control.tactile.picture_guard import UNEXPLAINED
 
 _SHOWN = 4  # presses in the picture
-_CONTRAST = 4  # of the change column
+_CONTRAST = 4  # factor on the change in its column
 _GRAVITY = 9.81  # m/s^2
 _MARGIN = 2.0  # times the threshold that a usual touch should have
 _UNLIKE = 5.0  # counts of local change; the usual drift between real touches gives 3

@@ -32,7 +32,7 @@ BLUR_PYRAMID = (3.0e-3, 1.5e-3, 0.75e-3, 0.35e-3)
 """Standard deviations of Taxim's gel, m; one factor scales them all."""
 
 _PIXELS = 5000  # pixels of a press that take part in the fit, at most
-_LIGHTS = 3  # whose shadows are fitted
+_LIGHTS = 3  # lights whose shadows are fitted
 _FOLDS = 4
 _MOVES = 8  # Gauss-Newton steps of a circle
 _RIDGE = 1e-3  # share of each term's own energy; 1e-4 to 1e-2 give nearly the same held-out error

@@ -22,7 +22,7 @@ MINIMUM = 16
 # mean of a few hundred pixels); slow drift of the light reached 7.
 _VISIBLE = 10.0
 _FAR = 3.0  # contact radii beyond which a press leaves the gel at rest
-_LINE_ROUNDS, _LINE_TOLERANCE = 4, 1.0  # of the robust line; counts
+_LINE_ROUNDS, _LINE_TOLERANCE = 4, 1.0  # rounds and tolerance (counts) of the robust line
 
 
 @dataclass(frozen=True)

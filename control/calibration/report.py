@@ -21,7 +21,7 @@ from touchgoal.runtime.errors import UserError
 _USELESS = 0.9  # L1 errors above this share of the background's: the fit explains nothing
 _AT_LIMIT = 0.2  # share of circles at a search limit that is worth a warning
 _MAX_SHOWN = 6  # held-out presses in the picture
-_CONTRAST = 4  # of the difference column
+_CONTRAST = 4  # factor on the difference in its column
 _PAIRS_A_ROW = 2
 _LIGHTS = {"R": (213, 94, 0), "G": (0, 158, 115), "B": (0, 114, 178)}  # Okabe and Ito
 _GREY, _INK, _PAPER = (150, 150, 150), (40, 40, 40), 255

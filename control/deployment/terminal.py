@@ -61,7 +61,7 @@ class Terminal:
         return self._request
 
     def show_tick(self, status: TickStatus) -> None:
-        """Write the status line anew, every few ticks."""
+        """Update the status line, every few ticks."""
         self._tick_count += 1
         if self._tick_count % _TICKS_PER_LINE or not self._shows:
             return

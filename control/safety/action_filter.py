@@ -21,7 +21,7 @@ Allows = Callable[[Joints, Float[np.ndarray, "c n"]], Bool[np.ndarray, " c"]]
 
 
 class Mode(StrEnum):
-    """What the arm does: follows the policy, brakes and waits, or is stopped until a restart."""
+    """Mode of the arm: it follows the policy, brakes and waits, or is stopped until a restart."""
 
     MOVE = "move"
     HOLD = "hold"

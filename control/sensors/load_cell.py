@@ -41,11 +41,11 @@ class LoadCellConfig:
     baud: Annotated[int, Field(gt=0)] = 115200
     """Speed of the serial port."""
     value_field: Annotated[int, Field(ge=0)] = 1
-    """Which comma-separated field of a line holds the value, from 0."""
+    """Index of the comma-separated field of a line with the value, from 0."""
     time_field: Annotated[int, Field(ge=0)] | None = 0
-    """Which field holds the device's clock, whose steps must be positive; None: none."""
+    """Index of the field with the device's clock, whose steps must be positive; None: no clock."""
     checksum: Checksum = "crc16"
-    """What lines end in: see `with_checksum`."""
+    """Checksum at the end of a line: see `with_checksum`."""
 
 
 @dataclass(frozen=True)

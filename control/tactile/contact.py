@@ -18,7 +18,7 @@ _LEARNING_THRESHOLD = 5.0  # counts; the strongest compression noise measured ha
 # Strength of a change per its median over the picture, above which it is no noise: Gaussian noise
 # reaches 6, presses of balls on a real Mini 16 to 25.
 _NOISE_PEAK = 8.0
-_RELEASE = 0.1  # of a contact's peak strength
+_RELEASE = 0.1  # share of a contact's peak strength at which it ends
 
 
 class ContactDetector:

@@ -27,7 +27,7 @@ _SCHEDULE = ((8, 5, 3), (4, 3, 2), (2, 1, 0))  # (cell's side in px, steps, of t
 _INNER = 5  # conjugate gradient steps to a Gauss-Newton step
 _MODEL_ERROR = 0.5  # counts by which a perfect calibration still differs from the picture
 _OUTLIER = 4.0  # standard deviations beyond which a pixel counts less
-_DAMPING = 0.01  # of the usual curvature
+_DAMPING = 0.01  # share of the usual curvature
 # Prior where colours leave the depth open: the lowest tenth of the surface is gel at rest, within
 # _REST of zero, counted once per patch of _PATCH pixels.
 _FLAT = 4e-6  # m around its upper end

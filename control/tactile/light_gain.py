@@ -20,7 +20,7 @@ LARGE_CHANGE = 2 * GAIN_SPREAD
 _ROWS = 32  # of cells that a picture is compared in; 30 x 40 at 240 x 320
 _DARK, _BRIGHT = 16.0, 250.0  # counts below which noise counts, and above which pixels clip
 _LEAST_CELLS = 0.05  # least share of usable cells for a channel's gain to be measured
-_LEAST_GAIN = 0.04  # of a picture that is all but black
+_LEAST_GAIN = 0.04  # gain of an almost black picture
 
 
 def light_gain(picture: AnyPicture, untouched: AnyPicture) -> Float32[np.ndarray, "3"]:

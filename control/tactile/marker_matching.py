@@ -45,11 +45,13 @@ class _Match(NamedTuple):
 def match(
     starts: list[Dots], spots: Spots, spacing: float, size: tuple[int, int]
 ) -> tuple[Dots, Flags]:
-    """Match dots with spots (px): positions, and which were found; the others are as expected.
+    """Return the dots' positions (px), and which were found among the spots; the others are
+    predicted.
 
-    `starts` are places where the dots may be, the first their last ones: the first that explains
-    the frame is taken, or if none does, the best. Jumps by up to a spacing come second. `spacing`
-    is the grid's, px; a dot outside the frame of `size` (width, height) is not missed.
+    `starts` are guesses of the positions, first those in the last frame. They are tried in order,
+    after the first one also its jumps by up to a spacing, until one explains the frame; else the
+    best is taken. `spacing` is the grid's, px; a dot outside the frame of `size` (width, height) is
+    not missed.
     """
     shape = starts[0].shape
     if not len(spots):

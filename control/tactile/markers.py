@@ -12,8 +12,8 @@ from touchgoal.control.tactile.marker_matching import Dots, Flags, Spots, match,
 from touchgoal.control.tactile.sensor_models import MarkerGrid
 from touchgoal.runtime.errors import UserError
 
-_FAINTEST = 0.5  # of the usual darkness: a fainter spot is no dot
-_LEAST_FOUND = 0.7  # of the grid, or it is no marker gel
+_FAINTEST = 0.5  # share of the usual darkness; a fainter spot is no dot
+_LEAST_FOUND = 0.7  # share of the grid's dots that a marker gel must show
 _NOISE = 0.02  # darkness of a spot that may be noise
 _RIM = 2.0  # px around a dot's nominal radius that may still be dark
 _LARGER = 1.1  # factor on the nominal radius: largest dots of another gel

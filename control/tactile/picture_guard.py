@@ -54,7 +54,7 @@ class _View:
     columns: bool  # mirrored left to right
 
     def undo(self, image: np.ndarray) -> np.ndarray:
-        """Return the picture as it was before."""
+        """Return the picture with this hypothesis undone."""
         image = image[..., list(self.order)]
         image = image[::-1] if self.rows else image
         return np.ascontiguousarray(image[:, ::-1] if self.columns else image)

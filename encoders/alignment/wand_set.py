@@ -73,7 +73,7 @@ class WandSet:
         return self.episodes.read(i, [ft.WAND_VIEWS[-1]], [0]).frames[ft.WAND_VIEWS[-1]][0]
 
     def touches(self, rows: Int[np.ndarray, " r"]) -> Touches:
-        """Return the firmest pictures of some touches, with their views, as training data. Long work."""
+        """Return the firmest pictures of some touches, with their views, as training data. Slow."""
         reading = track(rows, "reading touches", "touch", len(rows))
         pictures = [(*self.pictures(int(i)), self.view(int(i))) for i in reading]
         untouched, touched, views = (np.stack(kind) for kind in zip(*pictures, strict=True))
@@ -88,7 +88,7 @@ class WandSet:
     def embed_touches(
         self, embed: Callable[[Pictures, Picture], Float32[np.ndarray, "_ d"]]
     ) -> Float32[np.ndarray, "n d"]:
-        """Embed the firmest pictures by a function of pictures and their untouched one. Long work."""
+        """Embed the firmest pictures by a function of pictures and their untouched one. Slow."""
         rows = []
         for i in track(range(len(self)), "embedding touches", "touch"):
             untouched, touched = self.pictures(i)
@@ -100,7 +100,7 @@ class WandSet:
     ) -> Float32[np.ndarray, "n 1 i"]:
         """Embed the wand's own view before contact, which shows the place to be touched.
 
-        Each view is changed first; embeddings are not normalised. Long work.
+        Each view is changed first; embeddings are not normalised. Slow.
         """
         rows = [
             towers.embed_images(change(self.view(i))[None])

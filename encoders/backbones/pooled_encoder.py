@@ -43,7 +43,7 @@ class PooledEncoderConfig:
     towers: str | None = None
     text_dim: int = 0  # width of their text embeddings
     image_dim: int = 0  # width of their image embeddings; 0 without images
-    last_block: int = STAGES[-1][0]  # of the network
+    last_block: int = STAGES[-1][0]  # last block of the network that is used
 
     @classmethod
     def for_sensor(cls, sensor: str) -> "PooledEncoderConfig":

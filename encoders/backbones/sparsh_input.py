@@ -12,8 +12,8 @@ from touchgoal.runtime.errors import UserError
 SPARSH, SPARSH_PLAIN = "sparsh/v1", "sparsh-plain/v1"
 """With background subtraction, as Sparsh for DIGIT and GelSight Mini, and without, as for the GelSight
 of 2017."""
-_HEIGHT, _WIDTH = 4, 3  # of an upright image
-_GREY = 127  # of an unchanged pixel: 255 * 0.5, rounded down
+_HEIGHT, _WIDTH = 4, 3  # proportions of an upright image
+_GREY = 127  # grey level of an unchanged pixel: 255 * 0.5, rounded down
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ _PREFIXES = (
     "",
 )
 _PATCH, _BANDS, _POSITIONS = "patch_embed.proj.weight", "pos_embed.frequency_bands", "pos_embed"
-_HEAD_WIDTH = 64  # of ViTs from tiny to large; no shape tells the number of heads
+_HEAD_WIDTH = 64  # of ViTs from tiny to large; shapes do not show the number of heads
 _THEIRS = {
     "patch": "patch_embed.proj",
     "registers": "register_tokens",

@@ -1,4 +1,4 @@
-"""Validation of a self-supervised backbone after every epoch, for its loss says little."""
+"""Validation of a self-supervised backbone after every epoch, because its loss says little."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Sets that lerobot wrote, edited or continued: how they are told from touchgoal's own.
+"""Detection of sets that lerobot wrote, edited or continued.
 
 touchgoal writes one file under meta/episodes, and one data file an episode with a description in its
 footer; lerobot puts several episodes into a file, begins further files and drops the footers.

@@ -32,7 +32,7 @@ from touchgoal.episodes.importers.touch_clip import (
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
-_TRAINED = 0.725  # of GelSight recordings, the longest: Sparsh's train.py
+_TRAINED = 0.725  # share of GelSight recordings, the longest: Sparsh's train.py
 _LAYOUTS: dict[str, tuple[str, ...]] = {
     r"\d{8}_\d{6}\.pkl": ("gelsight_markers", "gelsight"),
     r"\d{3}\.pkl": ("gelsight_mini", "gelsight_mini_markers"),

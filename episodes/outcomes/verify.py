@@ -10,7 +10,7 @@ from touchgoal.control import features as ft
 from touchgoal.sim_envs.config import Outcome
 
 _LIFTED = 0.03  # m
-_TOLERANCE = 0.02  # m beside the goal that a success may lie
+_TOLERANCE = 0.02  # m: largest distance of a success from the goal
 _OVERGRIPPED = (36.0, 44.0)  # N of each finger
 _PRESSED = 20.0  # N upwards on the hand: the 120 successes of `TASK_FORCES` reach 16.5 N
 _OFF_CENTRE = 0.004  # m in the hand; successes stay within 0.003

@@ -110,7 +110,7 @@ def _start_from_hand(
 ) -> Float[Tensor, "... 12"]:
     """Return `features.TRUTH_START` relative to the hand's position and yaw."""
     cos, sin = turned[..., 0], turned[..., 1]
-    cos, sin = cos * cos - sin * sin, 2 * cos * sin  # of twice the hand's yaw
+    cos, sin = cos * cos - sin * sin, 2 * cos * sin  # cosine and sine of twice the hand's yaw
     yaw = torch.stack(
         [start[..., 3] * cos + start[..., 4] * sin, start[..., 4] * cos - start[..., 3] * sin], -1
     )

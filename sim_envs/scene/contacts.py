@@ -10,7 +10,7 @@ from numba import njit
 
 from touchgoal.sim_envs.scene.build import SIDES
 
-_IS_CONTACT = np.zeros(16, bool)  # which constraints are contacts (elliptic cones)
+_IS_CONTACT = np.zeros(16, bool)  # by constraint type: whether it is a contact (elliptic cones)
 _IS_CONTACT[int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)] = True
 _IS_CONTACT[int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)] = True
 SLIP_SPEED = 1e-3  # m/s of sliding between pad and object that counts as slip

@@ -68,7 +68,7 @@ def sample_instance(
     background = typical.background * brightness
     background += randomization.offset * rng.normal(size=3) + randomization.pattern * smooth
     tile = (h + NOISE_MARGIN, w + NOISE_MARGIN, 3)
-    common = np.sqrt(0.3)  # of the noise variance is the same in all channels
+    common = np.sqrt(0.3)  # 0.3 of the noise variance is the same in all channels
     noise = common * rng.normal(size=(*tile[:2], 1)) + np.sqrt(0.7) * rng.normal(size=tile)
     markers, radius = _markers(sensor, pitch, randomization.markers, rng)
     light = cv2.resize(

@@ -15,7 +15,7 @@ from touchgoal.sim_envs.twin.picture_process import STATE, Fault, Moment, Scene
 from touchgoal.sim_envs.twin.tcp_ports import Service
 
 CAMERA_RATE = 25  # Hz, as a fingertip's; more than a policy reads
-_START_TIMEOUT, _ANSWER_TIMEOUT, _END_TIMEOUT = 120.0, 60.0, 5.0  # s, on a machine however loaded
+_START_TIMEOUT, _ANSWER_TIMEOUT, _END_TIMEOUT = 120.0, 60.0, 5.0  # s, on a loaded machine, too
 _MOST_BEHIND = 2  # unanswered requests in real time, beyond which images are left out
 _PROGRAM = "from touchgoal.sim_envs.twin.picture_process import main; main()"
 
@@ -85,7 +85,7 @@ class Pictures(Service):
         self._tell((name, kind, time.monotonic() + seconds))
 
     def reset(self) -> None:
-        """Follow a new episode; the cameras' noise begins anew."""
+        """Follow a new episode; the cameras' noise restarts."""
         env = self._cell.env
         self._tell(Scene(env.model, env.config.camera_size, env.pads, env.np_random))
 

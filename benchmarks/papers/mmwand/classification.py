@@ -55,7 +55,7 @@ class Config(BenchmarkOptions):
     seeds: Count = 3
     """Splits of each kind."""
     fine_tuned: tuple[Network, ...] = ()
-    """Networks to fine-tune as well, on each split and modality; long work."""
+    """Networks to fine-tune as well, on each split and modality; slow."""
     modalities: tuple[Modality, ...] = ("image", "touch", "both")
     """Inputs of the fine-tuned networks."""
     epochs: Count = 12

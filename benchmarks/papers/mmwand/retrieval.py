@@ -61,7 +61,7 @@ class Config(BenchmarkOptions):
     """Training of the heads."""
     trained: tuple[Literal["vit-small", "efficientnet"], ...] = ()
     """Touch backbones to train on each split's touches, with and without the touch-text loss, one seed
-    each; long work."""
+    each; slow."""
     epochs: Count = 20
     """Passes of their training over the touches."""
     cache: Path = Path("runs/mmwand-embeddings")

@@ -29,7 +29,7 @@ _BATCH = 64
 
 
 def read_touch_data(data: WandSet, towers: Towers) -> TouchData:
-    """Read a whole set as training data; touch i has view i. Long work."""
+    """Read a whole set as training data; touch i has view i. Slow."""
     sensor = find_sensor_name(None, data.episodes)
     return prepare_touch_data(data.touches(np.arange(len(data))), towers, sensor, ())
 

@@ -27,7 +27,7 @@ class SurfacePose:
     centre: tuple[float, float]  # of the body on the gel, m along x and y from the image's middle
     turn: float  # about the gel's normal, rad
     tilt: tuple[float, float]  # slopes along x and y, m per m
-    texture_at: tuple[float, float]  # which cell of the texture lies in the body's middle
+    texture_at: tuple[float, float]  # cell of the texture in the body's middle
     depth: float  # depth of the highest point in the undeformed gel, m
 
 
