@@ -1,0 +1,251 @@
+"""Touch-use audit: does a fused cost need the touch of its own episode, at its own time?
+
+Each episode is measured again with its touch replaced; goals stay as they were. Differences are
+paired by episode, their intervals a bootstrap over episodes. The goal must not be a frame of the
+episode itself: against its own end every replacement costs more, whatever touch is worth.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.features.contact_reading import ContactReadings
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.metrics import measure_curve
+from touchgoal.runtime.errors import UserError
+
+REPLACEMENTS = {
+    "neutral": "untouched all the time, as in its first frame",
+    "shuffled": "its frames in random order",
+    "shifted": "a second late",
+    "mirrored": "left and right exchanged",
+    "another's": "of another episode, with another object where there is one",
+}
+"""Meaning of each replacement of an episode's touch."""
+
+METRICS = {
+    "order": "rank correlation of falling cost with time, mean over successes",
+    "last cost": "cost of the last frame, mean over successes",
+    "lag": "frames from first contact to half of the fall, mean over successes",
+    "AUC": "of the last cost, success against failure",
+}
+"""Meaning of each metric."""
+
+_SHIFT = 1.0  # s
+_DRAWS = 2000
+
+Measure = Callable[[EmbeddedEpisode, EmbeddedGoal], Curves]
+
+
+@dataclass(frozen=True)
+class AuditRow:
+    """One metric with one replacement; NaN where the metric is undefined."""
+
+    metric: str
+    replacement: str
+    real: float
+    replaced: float
+    low: float  # 95 % interval of replaced - real
+    high: float
+
+    @property
+    def differs(self) -> bool:
+        """Whether the interval of the difference excludes 0."""
+        return self.low > 0 or self.high < 0
+
+
+@dataclass(frozen=True)
+class AuditTable:
+    """Every metric with every replacement, and the verdict."""
+
+    rows: tuple[AuditRow, ...]
+    episodes: int
+
+    @property
+    def mattered(self) -> bool:
+        """Whether the order of the cost gets worse when the touch is shuffled in time."""
+        row = self._row("order", "shuffled")
+        return row is not None and row.high < 0
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in words."""
+        row = self._row("order", "shuffled")
+        if row is None or row.low != row.low:
+            return "touch use cannot be judged: the order of the cost is undefined"
+        change = f"{row.replaced - row.real:+.2f} [{row.low:.2f}, {row.high:.2f}]"
+        if not self.mattered:
+            return f"touch did not matter: shuffled in time, the cost's order changes by {change}"
+        other = self._row("last cost", "another's")
+        whose = "another episode's touch ends no differently"
+        if other is not None and other.low > 0:
+            whose = f"another episode's touch ends {other.replaced - other.real:.2f} farther away"
+        return f"touch mattered: shuffled in time, the cost's order changes by {change}; {whose}"
+
+    @property
+    def table(self) -> str:
+        """The rows as text, and the verdict."""
+        head = f"{'metric':<11}{'touch':<11}{'real':>7}{'replaced':>10}   difference, 95 % interval"
+        lines = [f"touch-use audit of {self.episodes} episodes", head]
+        for r in self.rows:
+            interval = f"{r.replaced - r.real:+.2f} [{r.low:.2f}, {r.high:.2f}]"
+            line = (
+                f"{r.metric:<11}{r.replacement:<11}{r.real:>7.2f}{r.replaced:>10.2f}   {interval}"
+            )
+            lines.append(line)
+        return "\n".join([*lines, self.verdict])
+
+    def _row(self, metric: str, replacement: str) -> AuditRow | None:
+        found = [r for r in self.rows if (r.metric, r.replacement) == (metric, replacement)]
+        return found[0] if found else None
+
+
+def audit_touch(
+    episodes: Sequence[EmbeddedEpisode],
+    goals: Sequence[EmbeddedGoal],
+    measure: Measure,
+    curve: str = "fused",
+) -> AuditTable:
+    """Return how each metric of a curve changes with each replacement of touch.
+
+    Episodes without a recorded outcome count as successes. UserError: fewer than two episodes, one
+    without touch, or one with a frame of itself as goal.
+
+    Args:
+        episodes: at least two, embedded alike, with touch.
+        goals: one an episode, of other episodes.
+        measure: returns the curves of an episode to a goal.
+        curve: name of the curve.
+    """
+    _check(episodes, goals)
+    real = _measured(episodes, goals, measure, curve)
+    rng, rows = np.random.default_rng(0), []
+    replaced = {
+        name: _measured(
+            [_replace(name, episodes, k, rng) for k in range(len(episodes))], goals, measure, curve
+        )
+        for name in REPLACEMENTS
+    }
+    failed = np.array([e.success is False for e in episodes])
+    for metric, name in product(METRICS, REPLACEMENTS):
+        if metric == "AUC" and (failed.all() or not failed.any()):
+            continue
+        rows.append(_row(metric, name, real, replaced[name], failed))
+    return AuditTable(tuple(rows), len(episodes))
+
+
+def _check(episodes: Sequence[EmbeddedEpisode], goals: Sequence[EmbeddedGoal]) -> None:
+    if len(episodes) < 2:
+        raise UserError(f"an audit of touch needs at least two episodes, not {len(episodes)}")
+    for episode, goal in zip(episodes, goals, strict=True):
+        if episode.touch is None:
+            raise UserError(f"{episode.source} has no touch to audit: leave --audit out")
+        if goal.same_episode:
+            raise UserError(
+                f"the goal of {episode.source} is a frame of itself, which decides an audit of "
+                "touch beforehand: give the end of another episode, or a bank of them"
+            )
+
+
+def _replace(
+    name: str, episodes: Sequence[EmbeddedEpisode], k: int, rng: np.random.Generator
+) -> EmbeddedEpisode:
+    """Return episode k with its touch replaced as `REPLACEMENTS` says."""
+    episode = episodes[k]
+    n, sides = len(episode), np.arange(len(episode.sides))
+    rows = np.arange(n)
+    match name:
+        case "neutral":
+            return _with_touch(episode, episode, np.zeros(n, int), sides)
+        case "shuffled":
+            return _with_touch(episode, episode, rng.permutation(n), sides)
+        case "shifted":
+            late = round(_SHIFT * episode.fps)
+            return _with_touch(episode, episode, np.maximum(rows - late, 0), sides)
+        case "mirrored":
+            return _with_touch(episode, episode, rows, sides[::-1])
+        case _:
+            other = _another(episodes, k)
+            scaled = np.rint(np.linspace(0, len(other) - 1, n)).astype(int)
+            return _with_touch(episode, other, scaled, sides)
+
+
+def _another(episodes: Sequence[EmbeddedEpisode], k: int) -> EmbeddedEpisode:
+    """Return the next episode with another object, or the next one if all have the same."""
+    later = [*episodes[k + 1 :], *episodes[:k]]
+    return next((e for e in later if e.object != episodes[k].object), later[0])
+
+
+def _with_touch(
+    episode: EmbeddedEpisode,
+    source: EmbeddedEpisode,
+    rows: Int[np.ndarray, " n"],
+    sides: Int[np.ndarray, " s"],
+) -> EmbeddedEpisode:
+    """Return an episode with touch and contact readings from rows and sides of a source."""
+    readings = source.readings
+    if readings is not None:
+        taken = readings.take(rows)
+        readings = ContactReadings(
+            taken.touching[sides],
+            None if taken.force is None else taken.force[sides],
+            None if taken.centre is None else taken.centre[sides],
+        )
+    return replace(episode, touch=source.touches()[sides][:, rows], readings=readings)
+
+
+def _measured(
+    episodes: Sequence[EmbeddedEpisode],
+    goals: Sequence[EmbeddedGoal],
+    measure: Measure,
+    curve: str,
+) -> dict[str, Float[np.ndarray, " episodes"]]:
+    """Return each metric of each episode, NaN where it is undefined."""
+    found = []
+    for episode, goal in zip(episodes, goals, strict=True):
+        metrics = measure_curve(measure(episode, goal).costs[curve], episode.contact.frame)
+        found.append((metrics.spearman, metrics.end, metrics.contact_lag))
+    order, last, lag = np.array(found, float).T
+    return {"order": order, "last cost": last, "lag": lag}
+
+
+def _row(
+    metric: str,
+    replacement: str,
+    real: dict[str, Float[np.ndarray, " n"]],
+    replaced: dict[str, Float[np.ndarray, " n"]],
+    failed: np.ndarray,
+) -> AuditRow:
+    rng = np.random.default_rng(0)
+    if metric == "AUC":
+        good, bad = np.flatnonzero(~failed), np.flatnonzero(failed)
+        pairs = [_auc(m["last cost"], good, bad) for m in (real, replaced)]
+        drawn = [(rng.choice(good, len(good)), rng.choice(bad, len(bad))) for _ in range(_DRAWS)]
+        changes = [
+            _auc(replaced["last cost"], *rows) - _auc(real["last cost"], *rows) for rows in drawn
+        ]
+        return AuditRow(metric, replacement, *pairs, *_limits(np.array(changes)))
+    both = np.isfinite(real[metric]) & np.isfinite(replaced[metric]) & ~failed
+    before, after = real[metric][both], replaced[metric][both]
+    if len(before) < 2:
+        return AuditRow(metric, replacement, *[float("nan")] * 4)
+    rows = rng.integers(len(before), size=(_DRAWS, len(before)))
+    limits = _limits((after - before)[rows].mean(axis=1))
+    return AuditRow(metric, replacement, float(before.mean()), float(after.mean()), *limits)
+
+
+def _auc(
+    cost: Float[np.ndarray, " n"], good: Int[np.ndarray, " a"], bad: Int[np.ndarray, " b"]
+) -> float:
+    """Return the share of pairs in which the failure costs more; ties count half."""
+    low, high = cost[good][:, None], cost[bad][None]
+    return float(np.mean((high > low) + 0.5 * (high == low)))
+
+
+def _limits(draws: Float[np.ndarray, " draws"]) -> tuple[float, float]:
+    low, high = np.quantile(draws, (0.025, 0.975))
+    return float(low), float(high)

@@ -1,0 +1,82 @@
+"""Touch-use audit on made-up episodes whose touch is known to matter, or not to."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from touchgoal.rewards.audit import REPLACEMENTS, audit_touch
+from touchgoal.rewards.curves import Contact, Curves
+from touchgoal.rewards.distance.normalizer import EmbeddingSource
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+from touchgoal.runtime.errors import UserError
+
+RNG = np.random.default_rng(0)
+NAMES = ("ball", "brick", "can")
+FELT = np.eye(8)[: len(NAMES)]  # touch of each object
+UNTOUCHED = np.eye(8)[-1]
+
+
+def episode(k: int, success: bool = True, n: int = 80) -> EmbeddedEpisode:
+    """Touches at half of its length, unless it fails; the camera sees a noisy way to the goal."""
+    name, contact = k % len(NAMES), n // 2
+    touch = np.tile(UNTOUCHED, (2, n, 1))
+    if success:
+        touch[:, contact:] = FELT[name]
+    touch += RNG.normal(0, 0.05, touch.shape)
+    seen = np.stack([np.linspace(0, 1, n) + RNG.normal(0, 0.3, n), np.ones(n)], axis=1)
+    return EmbeddedEpisode(
+        f"made up #{k}",
+        20.0,
+        Contact(contact if success else None, "truth"),
+        EmbeddingSource("offline", "front"),
+        image=seen.astype(np.float32),
+        sides=("left", "right"),
+        touch=touch.astype(np.float32),
+        object=NAMES[name],
+        success=success,
+    )
+
+
+def goal(e: EmbeddedEpisode) -> EmbeddedGoal:
+    touch = np.tile(FELT[NAMES.index(e.object)], (2, 1, 1)).astype(np.float32)
+    return EmbeddedGoal({}, frozenset(), touch=touch)
+
+
+def measure(e: EmbeddedEpisode, to: EmbeddedGoal) -> Curves:
+    assert to.touch is not None
+    felt = 1 - (e.touches() * to.touch).sum(-1).mean(0).astype(float)
+    costs = {"fused": 0.5 * (1 - e.pictures()[:, 0]) + 0.5 * felt}
+    return Curves(e.source, {}, e.fps, e.contact, costs, {})
+
+
+def shuffled(e: EmbeddedEpisode) -> EmbeddedEpisode:
+    return replace(e, touch=e.touches()[:, RNG.permutation(len(e))])
+
+
+def test_the_verdict_is_yes_where_touch_tells_and_no_where_it_was_shuffled() -> None:
+    told = [episode(k, success=k % 4 != 3) for k in range(40)]
+    goals = [goal(e) for e in told]
+    audit = audit_touch(told, goals, measure)
+    assert audit.mattered and audit.verdict.startswith("touch mattered: shuffled in time")
+    assert "another episode's touch ends" in audit.verdict and "farther away" in audit.verdict
+    rows = {(r.metric, r.replacement): r for r in audit.rows}
+    assert len(rows) == 4 * len(REPLACEMENTS)
+    assert rows["last cost", "neutral"].low > 0.3 and rows["lag", "shifted"].differs
+    assert rows["AUC", "neutral"].high < -0.1
+    assert not rows["last cost", "mirrored"].differs  # both fingertips feel the same here
+    told_nothing = [shuffled(e) for e in told]
+    audit = audit_touch(told_nothing, goals, measure)
+    assert not audit.mattered and "touch did not matter" in audit.table
+
+
+def test_what_cannot_be_audited_is_refused() -> None:
+    one = episode(0)
+    with pytest.raises(UserError, match="at least two episodes"):
+        audit_touch([one], [goal(one)], measure)
+    own = replace(goal(one), same_episode=frozenset({"tactile"}))
+    with pytest.raises(UserError, match="is a frame of itself"):
+        audit_touch([one, one], [own, own], measure)
+    without = replace(one, touch=None, sides=())
+    with pytest.raises(UserError, match="no touch to audit"):
+        audit_touch([without, without], [goal(one)] * 2, measure)
