@@ -1,5 +1,6 @@
 """The task of the paper's robot experiment: pick an object up and place it at a goal."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -100,11 +101,11 @@ class PickPlace(FrankaTactileEnv):
             self.bodies.append(
                 sample_body(other, rng, rng.uniform(*config.mass), f"distractor_{i + 1}")
             )
-        *self._positions, self.goal = _random_positions(rng, len(self.bodies) + 1)
-        if chosen.start is not None:
-            self._positions[0] = np.array(chosen.start)
-        if chosen.goal is not None:
-            self.goal = np.array(chosen.goal)
+        taken = [np.array(p) for p in (chosen.start, chosen.goal) if p is not None]
+        drawn = iter(_random_positions(rng, len(self.bodies) + 1 - len(taken), taken))
+        start = next(drawn) if chosen.start is None else np.array(chosen.start)
+        self._positions = [start, *(next(drawn) for _ in self.bodies[1:])]
+        self.goal = next(drawn) if chosen.goal is None else np.array(chosen.goal)
 
     def add_task_objects(self, spec: mujoco.MjSpec) -> None:
         """Add the disc that marks the goal."""
@@ -155,8 +156,8 @@ class PickPlace(FrankaTactileEnv):
         # A held object that grazes the table loses contact at times: below 1 mm it is down, too.
         down = self.object_on_table() or height < 1e-3
         self._put_down = self._lifted and down
-        there = self._put_down and away < self.config.tolerance and speed < 0.05
-        there &= self.asked == self.bodies[0].kind.name
+        near = away < self.config.tolerance and self.asked == self.bodies[0].kind.name
+        there = self._put_down and near and speed < 0.05
         placed = there and (let_go or not self.config.release)
         self._still_ticks = self._still_ticks + 1 if placed else 0
         success = self._still_ticks >= self.config.control_hz // 2
@@ -181,14 +182,16 @@ class PickPlace(FrankaTactileEnv):
         )
 
 
-def _random_positions(rng: np.random.Generator, n: int) -> list[np.ndarray]:
-    """Draw positions in the workspace (m), at least `_APART` from each other."""
+def _random_positions(
+    rng: np.random.Generator, n: int, taken: Sequence[np.ndarray] = ()
+) -> list[np.ndarray]:
+    """Draw positions in the workspace (m), `_APART` from each other and from those taken."""
     low, high = np.array(WORKSPACE).T
     points: list[np.ndarray] = []
     misses = 0
     while len(points) < n:
         point = rng.uniform(low, high)
-        if all(np.linalg.norm(point - other) > _APART for other in points):
+        if all(np.linalg.norm(point - other) > _APART for other in (*taken, *points)):
             points.append(point)
         else:
             misses += 1

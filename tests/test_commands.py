@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shutil
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,14 +14,15 @@ import torch
 from in_process import in_process_workers
 from safetensors.torch import load_file
 
-from touchgoal.benchmarks.papers import reward_quality
+from touchgoal.benchmarks.papers.reward_quality import recording
+from touchgoal.benchmarks.papers.reward_quality.recording import KINDS
 from touchgoal.control.features import STATE
 from touchgoal.encoders import pretrained
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import COMMANDS, main, usage
 from touchgoal.policies import checkpoint
-from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.experts.pick_place import OUTCOMES
 
 pytestmark = pytest.mark.usefixtures("in_process")
 
@@ -289,12 +289,19 @@ def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
 
 @pytest.mark.slow
 def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = partial(PickPlaceConfig, control_hz=5, cameras=("front",))
-    monkeypatch.setattr(reward_quality, "PickPlaceConfig", small)
-    run("benchmark", "reward-quality", "--episodes", 1, "--out", tmp_path)
-    result = json.loads((tmp_path / "metrics.json").read_text())
-    assert len(result["claims"]) == 5 and len(result["episodes"]) == 5
-    assert {e["outcome"] for e in result["episodes"]} >= {"success", "never_touch", "drop"}
+    monkeypatch.setattr(recording, "HELD_OUT_OBJECTS", ("brick", "toy_brick"))
+    monkeypatch.setattr(recording, "TRAINING_OBJECTS", ("candle", "soda_can"))
+    monkeypatch.setattr("touchgoal.rewards.fit_value._STEPS", 5)
+    sizes = "--episodes 1 --suboptimal 1 --successes 2 --training 4 --goals 1 --calibration 9"
+    run(
+        *f"benchmark reward-quality {sizes} --scenes fixed --every 2 --env.control-hz 5 --env.camera-size 64 64".split(),
+        "--out",
+        tmp_path,
+    )
+    result = json.loads((tmp_path / "metrics.json").read_text())["scenes"]["fixed"]
+    assert set(result["auc"]) == {*KINDS, "mean of true kinds"} and len(KINDS) == 13
+    assert result["episodes"] == dict.fromkeys(OUTCOMES, 1) | {"success": 2}
+    assert result["success"]["demonstrations"] == 9 and len(result["claims"]) >= 4
 
 
 def test_mistakes_leave_nothing(

@@ -11,15 +11,12 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from touchgoal.benchmarks.papers import reward_quality
-from touchgoal.benchmarks.papers.reward_quality import collect_goals, is_goal
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT, WRIST
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS
-from touchgoal.episodes.recording import EpisodeSpec
-from touchgoal.episodes.schema import Episode, MetaValue
+from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.rewards.curves import Contact, first_contact
 from touchgoal.rewards.distance.embedding_distance import compute_curves, compute_distances
@@ -36,7 +33,6 @@ from touchgoal.rewards.goals import (
     parse_goal,
 )
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.config import PickPlaceConfig
 
 ALL: tuple[Modality, ...] = ("image", "tactile", "text")
 
@@ -207,31 +203,6 @@ def test_encoders_without_words_measure_touch() -> None:
         assert e.made_with.sensor == "gelsight_mini" and e.made_with.encoder
         with pytest.raises(UserError, match="was not aligned with texts"):
             check_words([Sentence("hard")], encoder)
-
-
-def test_only_successes_with_the_encoders_sensor_are_goals() -> None:
-    reached: dict[str, MetaValue] = {"sensor": "gelsight_mini", "success": True}
-    assert is_goal(reached, "gelsight_mini")
-    assert not is_goal(reached | {"success": False}, "gelsight_mini")
-    with pytest.raises(UserError, match="recorded with gelsight_mini, the encoder is for digit"):
-        is_goal(reached, "digit")
-
-
-def test_goals_that_failed_are_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The expert fails with the second object, once."""
-
-    def collect(
-        root: Path, config: PickPlaceConfig, specs: list[EpisodeSpec], workers: int
-    ) -> None:
-        for spec in specs:
-            success = not (spec.options["object"] == "cork" and spec.seed == 3_000_001)
-            meta: dict[str, MetaValue] = {"sensor": config.sensor, "success": success}
-            EpisodeWriter(root).append(replace(recorded(), meta=meta))
-
-    monkeypatch.setattr(reward_quality, "collect", collect)
-    ends = collect_goals(["brick", "cork", "candle"], "gelsight_mini", tmp_path, 1)
-    found = [(end.root.name, end.index) for end in ends]
-    assert found == [("goals-0", 0), ("goals-1", 0), ("goals-0", 2)]
 
 
 def test_an_episode_embedded_in_chunks_is_the_whole(embedder: EpisodeEmbedder) -> None:

@@ -1,0 +1,75 @@
+"""Embedding of recorded episodes on all cores, each kept in a file, so that a run can go on."""
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+import torch
+
+from touchgoal.benchmarks.papers.reward_quality.recording import Recorded
+from touchgoal.control.features import CAMERAS, TACTILE, TRUTH_CONTACT
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.towers.towers import load_towers
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.rewards.features.embedded import EmbeddedEpisode
+from touchgoal.rewards.features.embedder import EpisodeEmbedder
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.progress import progress_bar
+from touchgoal.runtime.worker_pool import one_core_workers
+
+
+@dataclass(frozen=True)
+class EmbeddedFiles:
+    """Embedded episodes in a folder, one file each, of one touch encoder."""
+
+    folder: Path
+    encoder: str
+    every: int = 1  # frames are embedded, the last one among them
+
+    def path(self, recorded: Recorded) -> Path:
+        """Return the file of an episode."""
+        made_with = load_embedder(self.encoder).made_with
+        name = f"{recorded.root.name}-{recorded.index:05d}.pickle"
+        return self.folder / f"{made_with.encoder}-{made_with.towers}-{self.every}" / name
+
+    def make(self, recorded: Sequence[Recorded], workers: int) -> None:
+        """Embed the episodes that have no file yet."""
+        missing = [r for r in recorded if not self.path(r).exists()]
+        if not missing:
+            return
+        with (
+            one_core_workers(workers) as pool,
+            progress_bar("embedding", len(missing), "episode") as bar,
+        ):
+            for _ in pool.map(partial(_embed, self), missing):
+                bar.update()
+
+    def load(self, recorded: Recorded) -> EmbeddedEpisode:
+        """Return an embedded episode."""
+        return pickle.loads(self.path(recorded).read_bytes())
+
+
+@cache
+def load_embedder(encoder: str) -> EpisodeEmbedder:
+    """Return the embedder of a touch encoder, with the towers that it was aligned with."""
+    touch = pretrained.load_encoder(encoder)
+    return EpisodeEmbedder(load_towers(touch.towers or "offline"), touch)
+
+
+def _embed(files: EmbeddedFiles, recorded: Recorded) -> None:
+    torch.set_num_threads(1)
+    episodes = EpisodeSet(recorded.root)
+    i, embedder = recorded.index, load_embedder(files.encoder)
+    keys = [key for key in (*CAMERAS, *TACTILE, TRUTH_CONTACT) if key in episodes.features]
+    frames = range((episodes.lengths[i] - 1) % files.every, episodes.lengths[i], files.every)
+    embedded = embedder.embed_episode(
+        episodes.read(i, keys, frames),
+        episodes.fps / files.every,
+        f"{recorded.root.name}#{i}",
+        descriptions=embedder.knows_words,
+    )
+    path = files.path(recorded)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, pickle.dumps(embedded))

@@ -1,0 +1,95 @@
+"""Curves of embedded episodes to the ends of other successes with the same object."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from touchgoal.benchmarks.papers.reward_quality.embedding import EmbeddedFiles, load_embedder
+from touchgoal.benchmarks.papers.reward_quality.measures import Judged
+from touchgoal.benchmarks.papers.reward_quality.recording import Recorded
+from touchgoal.benchmarks.papers.reward_quality.sentences import SENTENCES
+from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
+from touchgoal.rewards.distance.normalizer import DistanceNormalizer
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal, goal_at_every_frame
+from touchgoal.rewards.fit_value import fit_value
+from touchgoal.rewards.goals import Goal, OwnFrame, Sentence
+from touchgoal.rewards.value import Value
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
+
+_SCENE = "simulated pick-place"  # of the normalizer, and the task of the value
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Units, value and goals of one scene, fitted on the training objects."""
+
+    files: EmbeddedFiles
+    normalizer: DistanceNormalizer
+    value: Value
+    goals: dict[str, EmbeddedGoal]  # by object
+
+    def curves(self, episode: EmbeddedEpisode, goal: EmbeddedGoal) -> Curves:
+        """Return the curves of an episode to a goal."""
+        return compute_curves(episode, goal, self.normalizer, self.value)
+
+    def judge(self, recorded: Sequence[Recorded]) -> list[Judged]:
+        """Measure episodes against the goals of the object that was asked for."""
+        judged = []
+        for r in track(recorded, "measuring", "episode"):
+            episode = self.files.load(r)
+            costs = self.curves(episode, self.goals[r.object]).costs
+            judged.append(Judged(r.outcome, r.object, len(episode) / episode.fps, costs))
+        return judged
+
+    def to_every_goal(self, recorded: Sequence[Recorded]) -> list[dict[str, dict[str, float]]]:
+        """Return the last costs of episodes to the goals of each other's objects: [episode][goal]."""
+        episodes = [self.files.load(r) for r in recorded]
+        return [
+            {
+                r.object: {
+                    n: float(c[-1]) for n, c in self.curves(e, self.goals[r.object]).costs.items()
+                }
+                for r in recorded
+            }
+            for e in episodes
+        ]
+
+    def to_own_end(self, recorded: Sequence[Recorded]) -> list[tuple[Curves, Curves | None]]:
+        """Return the curves of episodes to their own last frame; with a sentence for touch, too."""
+        embedder, found = load_embedder(self.files.encoder), []
+        for r in track(recorded, "measuring own ends", "episode"):
+            episode, words = self.files.load(r), None
+            own = embedder.embed_goal(Goal(image=OwnFrame(), tactile=OwnFrame()), episode)
+            if embedder.knows_words:
+                sentence = Sentence(SENTENCES[r.object])
+                goal = embedder.embed_goal(Goal(image=OwnFrame(), text=sentence), episode)
+                words = self.curves(episode, goal)
+            found.append((self.curves(episode, own), words))
+        return found
+
+
+def fit_judge(files: EmbeddedFiles, recorded: Sequence[Recorded]) -> Judge:
+    """Fit units and value on the training episodes of a scene, and take its goals."""
+    training = [files.load(r) for r in recorded if r.purpose == "training"]
+    normalizer = fit_normalizer(training, training[0].modalities, _SCENE)
+    ends: dict[str, list[EmbeddedEpisode]] = {}
+    for r in recorded:
+        if r.purpose == "goal":
+            episode = files.load(r)
+            ends.setdefault(r.object, []).append(episode.take(slice(len(episode) - 1, None)))
+    goals = {name: _bank(files.encoder, name, found) for name, found in ends.items()}
+    for r in recorded:
+        if r.object not in goals and r.purpose == "test":
+            raise UserError(f"no goal for {r.object}: its expert always failed; see {r.root}")
+    return Judge(files, normalizer, fit_value(training, _SCENE), goals)
+
+
+def _bank(encoder: str, name: str, ends: Sequence[EmbeddedEpisode]) -> EmbeddedGoal:
+    """Return the successful ends as one goal, with the object's sentence if touch knows words."""
+    goal = goal_at_every_frame(ends[0].extended(ends[1:]))
+    embedder = load_embedder(encoder)
+    if not embedder.knows_words:
+        return goal
+    return replace(goal, text=embedder.embed_sentences([SENTENCES[name]]))
