@@ -27,7 +27,10 @@ BENCHMARKS = {
         "papers.mmwand.real.zero_shot",
         "materials of real objects by sentences (MMWand III)",
     ),
-    "reward-quality": ("papers.reward_quality.benchmark", "dense costs against outcomes (MMWand V-E)"),
+    "reward-quality": (
+        "papers.reward_quality.benchmark",
+        "dense costs against outcomes (MMWand V-E)",
+    ),
     "tacbench": ("papers.tacbench.benchmark", "force, slip, pose, grasp, cloth from frozen touch"),
     "real-touch": ("real_touch.videos", "encoders on labelled videos of real touch"),
     "real-force": ("real_touch.forces", "force and contact on real grasps with a load cell"),
