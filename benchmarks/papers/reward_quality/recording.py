@@ -24,7 +24,7 @@ KINDS = tuple(o for o in OUTCOMES if o not in ("success", *SUBOPTIMAL))
 """Outcomes that are failures."""
 
 _ATTEMPTS = 6  # rounds in which what did not come out as asked is drawn again
-_SEEDS = 10_000  # seeds of one outcome
+_APART = 10_000  # between the first episodes of two outcomes
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Wanted:
     @property
     def seeds(self) -> range:
         """Seeds that this outcome may use."""
-        return range(self.first_seed, self.first_seed + _SEEDS)
+        return range(self.first_seed, self.first_seed + _APART)
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,9 @@ def plan(scene: Scene, sizes: Sizes) -> list[Wanted]:
     return [
         Wanted("training", "success", sizes.training, TRAINING_OBJECTS, training),
         Wanted("goal", "success", n_goals, held_out, goals),
-        Wanted("calibration", "success", sizes.calibration, held_out, goals + _SEEDS),
+        Wanted("calibration", "success", sizes.calibration, held_out, goals + _APART),
         *(
-            Wanted("test", o, counts.get(o, sizes.successes), held_out, test + k * _SEEDS)
+            Wanted("test", o, counts.get(o, sizes.successes), held_out, test + k * _APART)
             for k, o in enumerate(OUTCOMES)
         ),
     ]
