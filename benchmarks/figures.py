@@ -86,7 +86,7 @@ def real_force(metrics: Metrics) -> str:
 
 def markers(metrics: Metrics) -> str:
     """Share of dots near the other tracker's."""
-    return f"{metrics['near']:.1%} of {metrics['dots']}; {metrics['exchanged']} exchanged"
+    return f"{metrics['near']:.1%} of {metrics['dots']} dots; {metrics['exchanged']} exchanged"
 
 
 def nearest(metrics: Metrics) -> str:

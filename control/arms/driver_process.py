@@ -20,7 +20,7 @@ from typing import Any, Protocol, runtime_checkable
 from touchgoal.control.interfaces import DriverError
 from touchgoal.runtime.errors import UserError
 
-_GRACE = 1.0  # s that the kernel's alarm gives beyond the parent's patience
+_GRACE = 1.0  # s that the kernel's alarm waits beyond the parent's time-out
 _CLOSING = 3.0  # s to bring an arm to rest and disconnect
 NEVER = 1e6  # s, period of a driver that ticks on request alone
 _EXIT_WITH_REASON = 3  # exit code; the reason is the last line of output

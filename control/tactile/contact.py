@@ -9,7 +9,7 @@ from touchgoal.control.tactile.light_gain import remove_gain
 
 THRESHOLD = 1.2  # counts; noise of 1 count has a strength of 0.3, at most 0.45
 # Threshold of a noisy sensor per usual strength of its untouched frames. On 409 clips of a real
-# Mini (PhysiCLeAR) 2.5 finds every touch; from 2 on down, frames without any are taken for touches.
+# Mini (PhysiCLeAR) 2.5 finds every touch; at 2 and below, untouched frames count as touches.
 _SPARE = 2.5
 _LEARNING_FRAMES = 10  # 0.4 s of a 25 Hz sensor
 _LEARNING_QUANTILE = 0.3

@@ -45,8 +45,7 @@ class _Match(NamedTuple):
 def match(
     starts: list[Dots], spots: Spots, spacing: float, size: tuple[int, int]
 ) -> tuple[Dots, Flags]:
-    """Return the dots' positions (px), and which were found among the spots; the others are
-    predicted.
+    """Return the dots' positions (px), and which were found; the others are predicted.
 
     `starts` are guesses of the positions, first those in the last frame. They are tried in order,
     after the first one also its jumps by up to a spacing, until one explains the frame; else the
