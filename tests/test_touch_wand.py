@@ -12,6 +12,7 @@ from in_process import in_process_workers
 from touchgoal.control import features as ft
 from touchgoal.control.wand_touch import MAX_FORCE
 from touchgoal.encoders.alignment.green_screen import (
+    background_changer,
     foreground,
     random_background,
     replace_background,
@@ -127,6 +128,12 @@ def test_the_green_screen_is_cut_out(name: str) -> None:
     env.close()
     with pytest.raises(UserError, match="no green screen"):
         foreground(np.full((64, 64, 3), 200, np.uint8))
+    covered = np.full((64, 64, 3), (200, 40, 40), np.uint8)
+    change = background_changer("generated", 0)
+    with pytest.raises(UserError, match="no green screen"):
+        change(covered)
+    change(touch.views["top"])  # now the screen's colour is known
+    np.testing.assert_array_equal(change(covered), covered)
 
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:

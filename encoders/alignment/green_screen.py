@@ -21,42 +21,53 @@ Alpha = Float32[np.ndarray, "h w"]
 _NEAR, _FAR = 0.035, 0.09  # distance from the screen's chromaticity: surely screen, surely not
 _DARK = 12  # counts, sum of the colours, below which a pixel's chromaticity is unreliable
 _GREEN = 0.45  # least share of green in a screen
+_LEAST_GREEN = 0.05  # least share of a picture that a screen takes up
 _SMALLEST = 6  # px: specks below this area are noise
 _PICTURES = (".png", ".jpg", ".jpeg")
 
 
-def screen_chromaticity(picture: Picture) -> Float32[np.ndarray, "2"]:
-    """Return the screen's shares of red and green: the commonest among the green pixels.
+Shares = Float32[np.ndarray, "2"]
+"""Shares of red and green in a colour."""
 
-    Raises:
-        UserError: hardly anything in the picture is green.
-    """
+
+def screen_chromaticity(picture: Picture) -> Shares | None:
+    """Return the commonest colour among the green pixels; None where hardly anything is green."""
     shares, bright = _chromaticity(picture)
     green = bright & (shares[..., 1] > _GREEN)
-    if green.mean() < 0.05:
-        raise UserError("no green screen: less than 5 % of the picture is green")
+    if green.mean() < _LEAST_GREEN:
+        return None
     bins = np.round(shares[green] * 100).astype(int)
     _, index, count = np.unique(bins, axis=0, return_inverse=True, return_counts=True)
     return np.median(shares[green][index.ravel() == count.argmax()], axis=0).astype(np.float32)
 
 
-def foreground(picture: Picture) -> Alpha:
+def foreground(picture: Picture, known: Shares | None = None) -> Alpha:
     """Return how much of each pixel stands before the screen, 0 to 1.
 
+    Args:
+        picture: RGB.
+        known: the screen's colour in other pictures, for one in which an object hides the screen.
+
     Raises:
-        UserError: there is no green screen.
+        UserError: no green screen is seen, nor is its colour known.
     """
+    screen = screen_chromaticity(picture)
+    screen = known if screen is None else screen
+    if screen is None:
+        raise UserError(f"no green screen: less than {_LEAST_GREEN:.0%} of the picture is green")
     shares, bright = _chromaticity(picture)
-    away = np.linalg.norm(shares - screen_chromaticity(picture), axis=2)
+    away = np.linalg.norm(shares - screen, axis=2)
     alpha = np.clip((away - _NEAR) / (_FAR - _NEAR), 0, 1)
     alpha[~bright] = 1  # black is no screen: a screen in shadow is still green
     return _without_specks(alpha.astype(np.float32))
 
 
-def replace_background(picture: Picture, background: Picture) -> Picture:
-    """Return the picture's foreground on another background of any size."""
+def replace_background(
+    picture: Picture, background: UInt8[np.ndarray, "H W 3"], known: Shares | None = None
+) -> Picture:
+    """Return the picture's foreground on another background of any size, see `foreground`."""
     h, w = picture.shape[:2]
-    alpha = foreground(picture)[..., None]
+    alpha = foreground(picture, known)[..., None]
     behind = cv2.resize(background, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32)
     mixed = alpha * _without_spill(picture, alpha[..., 0]) + (1 - alpha) * behind
     return np.clip(mixed + 0.5, 0, 255).astype(np.uint8)
@@ -102,10 +113,17 @@ def background_changer(backgrounds: str, seed: int) -> Callable[[Picture], Pictu
     if backgrounds == "screen":
         return lambda picture: picture
     rng = np.random.default_rng(seed)
-    if backgrounds == "generated":
-        return lambda picture: replace_background(picture, random_background(rng))
-    pictures = read_backgrounds(Path(backgrounds))
-    return lambda picture: replace_background(picture, pictures[rng.integers(len(pictures))])
+    known: Shares | None = None
+    pictures = None if backgrounds == "generated" else read_backgrounds(Path(backgrounds))
+
+    def change(picture: Picture) -> Picture:
+        nonlocal known
+        screen = screen_chromaticity(picture)
+        known = known if screen is None else screen
+        behind = pictures[rng.integers(len(pictures))] if pictures else random_background(rng)
+        return replace_background(picture, behind, known)
+
+    return change
 
 
 def _chromaticity(picture: Picture) -> tuple[Float32[np.ndarray, "h w 2"], Bool[np.ndarray, "h w"]]:
