@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from touchgoal.runtime.option_types import Seed, checked_dataclass
+from touchgoal.runtime.option_types import CountOrNone, Seed, checked_dataclass
 
 
 @checked_dataclass
@@ -27,6 +27,9 @@ class Config:
     value: bool = False
     """Also fit a value of the task, from 4 successes on, in a minute or two. It holds for this task,
     these cameras and towers, and does not read the goal."""
+    success_from: CountOrNone = 0
+    """Number of successes, the last ones, that fit nothing else and set the threshold of success
+    (success.json): at least 9, for at most 10 % of successes rejected. 0: no threshold."""
     camera: str = "front"
     """Camera of the plain distance of images: front or wrist."""
     encoder: str | None = None
@@ -53,6 +56,8 @@ def main(config: Config) -> None:
     from touchgoal.rewards.fit_value import fit_value
     from touchgoal.rewards.reward_model import load_embedder
     from touchgoal.rewards.sources.open_source import open_successes
+    from touchgoal.rewards.success import SUCCESS, check_demonstrations, fit_success, last_costs
+    from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.progress import track
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run
@@ -61,20 +66,30 @@ def main(config: Config) -> None:
     sources = open_successes(config.sources, config.camera, with_touch, config.assume_success)
     inputs = sources[0].inputs
     embedder, _ = load_embedder(inputs, config.encoder, config.towers, config.device)
-    out = open_run(config.out, "fit-normalizer", config)
     trajectories = [t for source in sources for t in source.trajectories]
+    if config.success_from:
+        check_demonstrations(config.success_from)
+        if config.success_from > len(trajectories) - 2:
+            raise UserError(
+                f"--success-from is {config.success_from}, which leaves fewer than two of "
+                f"{len(trajectories)} successes to fit on"
+            )
+    out = open_run(config.out, "fit-normalizer", config)
     embedded = [
         embedder.embed_chunks(t.chunks(), t.fps, t.source, descriptions=True)
         for t in track(trajectories, "embedding", "trajectory")
     ]
+    calibration = embedded[len(embedded) - config.success_from :]
+    embedded = embedded[: len(embedded) - config.success_from]
     has_words = all(one.descriptions is not None for one in embedded)
     modalities = config.modalities or tuple(
         m for m in embedded[0].modalities if m != "text" or has_words
     )
     normalizer = fit_normalizer(embedded, modalities, inputs.scene)
     value = fit_value(embedded, inputs.fitted_task, config.seed) if config.value else None
+    ends = SuccessfulEnds.of(embedded)
     normalizer.save(out / NORMALIZER)
-    SuccessfulEnds.of(embedded).save(out / GOAL_FILE)
+    ends.save(out / GOAL_FILE)
     if value is not None:
         value.save(out, provenance())
     print(f"{'fitted':<24}{'usual start':>12}{'usual end':>12}{'separated':>12}")
@@ -87,5 +102,9 @@ def main(config: Config) -> None:
     print("  same episode   the goal is the episode's own last frame, else another's or a sentence")
     units = ", ".join(f"{name} {unit:.3g}" for name, unit in normalizer.unit.items())
     print(f"spread of successful ends by part: {units or 'none, for no two hold the same object'}")
+    if calibration:
+        threshold = fit_success(last_costs(calibration, ends, normalizer, value))
+        threshold.save(out / SUCCESS)
+        print(threshold)
     goal = f"--goal goal:{out / GOAL_FILE} --normalizer {out / NORMALIZER}"
     print(f"next: touchgoal reward-curves {config.sources[0]} {goal}")

@@ -49,6 +49,9 @@ class Config:
     discount factor of the RL algorithm that uses the reward."""
     plots: CountOrNone = 100
     """Number of trajectories, from the first, that get a plot of their own."""
+    audit: CountOrNone = 0
+    """Number of trajectories, from the first, whose touch is replaced to see if it mattered. They are
+    embedded once more and held in memory; goals must come from other trajectories."""
     workers: Count = 2
     """Number of threads that decode ahead of the encoders."""
     device: str = "cpu"
@@ -59,6 +62,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, measure what is not measured yet, and write the reports."""
+    from touchgoal.rewards.audit import audit_trajectories
     from touchgoal.rewards.default_goal import goals_of
     from touchgoal.rewards.goals import Bank, OwnFrame, assign_goals, parse_goal
     from touchgoal.rewards.measure import Measurement, write_skipped
@@ -68,6 +72,7 @@ def main(config: Config) -> None:
     from touchgoal.rewards.reward_model import RewardModel, load_reward_model
     from touchgoal.rewards.sources.open_source import open_source
     from touchgoal.rewards.sources.trajectory import Trajectory
+    from touchgoal.rewards.success import load_success_threshold
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.run_folder import open_run
 
@@ -93,6 +98,8 @@ def main(config: Config) -> None:
         goal = assign_goals([goals[trajectory.name]], source.inputs.modalities)
         return replace(model, goal=goal)
 
+    if config.audit and any(isinstance(g, OwnFrame) for g in (*given, *goals.values())):
+        raise UserError("--audit needs goals from other trajectories: --goal bank:SET, for example")
     out = open_run(config.out, "reward-curves", config)
     measurement = Measurement(source.trajectories, model_of, out, config.gamma, config.plots)
     total = len(source.trajectories) + len(source.skipped)
@@ -108,6 +115,9 @@ def main(config: Config) -> None:
     summary = write_skipped(skipped, total, out)
     if not measurement.records:
         raise UserError(f"nothing could be measured: {skipped[0].reason}")
-    report_all(measurement.records, out, model.provenance())
+    threshold = load_success_threshold(config.normalizer)
+    audited = source.trajectories[: config.audit]
+    audit = audit_trajectories(audited, model_of).table if audited else ""
+    report_all(measurement.records, out, model.provenance(), threshold, audit)
     print(summary)
     print(f"next: look at {out / PAGE}; train on {out / FRAMES}")

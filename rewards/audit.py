@@ -13,10 +13,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.features.contact_reading import ContactReadings
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.metrics import measure_curve
+from touchgoal.rewards.reward_model import RewardModel
+from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 REPLACEMENTS = {
     "neutral": "untouched all the time, as in its first frame",
@@ -122,6 +126,10 @@ def audit_touch(
         curve: name of the curve.
     """
     _check(episodes, goals)
+    if curve not in measure(episodes[0], goals[0]).costs:
+        raise UserError(
+            f"an audit of touch needs the curve '{curve}': give a --normalizer with units"
+        )
     real = _measured(episodes, goals, measure, curve)
     rng, rows = np.random.default_rng(0), []
     replaced = {
@@ -136,6 +144,23 @@ def audit_touch(
             continue
         rows.append(_row(metric, name, real, replaced[name], failed))
     return AuditTable(tuple(rows), len(episodes))
+
+
+def audit_trajectories(
+    trajectories: Sequence[Trajectory], model_of: Callable[[Trajectory], RewardModel]
+) -> AuditTable:
+    """Embed trajectories and audit their touch; see `audit_touch`."""
+    models = [model_of(t) for t in trajectories]
+    embedded = [
+        model.embedder.embed_chunks(t.chunks(), t.fps, t.source)
+        for t, model in zip(track(trajectories, "auditing", "trajectory"), models, strict=True)
+    ]
+    goals = [m.embedder.embed_goal(m.goal, e) for m, e in zip(models, embedded, strict=True)]
+
+    def measure(episode: EmbeddedEpisode, goal: EmbeddedGoal) -> Curves:
+        return compute_curves(episode, goal, models[0].normalizer, models[0].value)
+
+    return audit_touch(embedded, goals, measure)
 
 
 def _check(episodes: Sequence[EmbeddedEpisode], goals: Sequence[EmbeddedGoal]) -> None:

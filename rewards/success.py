@@ -15,13 +15,20 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
+from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.normalizer import DistanceNormalizer
+from touchgoal.rewards.distance.parts import FUSED
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, goal_at_every_frame
+from touchgoal.rewards.features.successful_ends import SuccessfulEnds
+from touchgoal.rewards.value import Value
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
 SUCCESS = "success.json"
 """Name of the file, beside the normalizer."""
+REJECTED = 0.1
+"""Default bound on the share of successes that are rejected."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +40,9 @@ class SuccessThreshold:
     rejected: float  # bound on the share of successes that are rejected
     demonstrations: int  # number of last costs behind it
 
-    def accepts(self, cost: Float[np.ndarray, " n"]) -> bool:
-        """Return whether an episode with this curve ended in success."""
-        return bool(cost[-1] <= self.cost)
+    def accepts(self, last_cost: float) -> bool:
+        """Return whether an episode with this last cost ended in success."""
+        return last_cost <= self.cost
 
     def __str__(self) -> str:
         return (
@@ -48,22 +55,45 @@ class SuccessThreshold:
         write_file(path, (json.dumps(asdict(self), indent=2) + "\n").encode())
 
 
-def fit_success(last_costs: Sequence[float], curve: str, rejected: float = 0.1) -> SuccessThreshold:
+def fit_success(costs: Sequence[float], rejected: float = REJECTED) -> SuccessThreshold:
     """Return the threshold from the last costs of demonstrations that fitted nothing else.
 
     UserError: too few demonstrations for the bound.
 
     Args:
-        last_costs: one a demonstration, to goals of the kind that later episodes are measured with.
-        curve: name of their curve.
+        costs: last fused costs, one a demonstration, to goals of the kind that later episodes are
+            measured with.
         rejected: bound on the share of successes that are rejected.
     """
-    check_demonstrations(len(last_costs), rejected)
-    rank = _rank(len(last_costs), rejected)
-    return SuccessThreshold(float(np.sort(last_costs)[rank - 1]), curve, rejected, len(last_costs))
+    check_demonstrations(len(costs), rejected)
+    rank = _rank(len(costs), rejected)
+    return SuccessThreshold(float(np.sort(costs)[rank - 1]), FUSED, rejected, len(costs))
 
 
-def check_demonstrations(demonstrations: int, rejected: float) -> None:
+def last_costs(
+    episodes: Sequence[EmbeddedEpisode],
+    ends: SuccessfulEnds,
+    normalizer: DistanceNormalizer,
+    value: Value | None,
+) -> list[float]:
+    """Return the last fused cost of each episode to the ends of successes with its object.
+
+    UserError: there is no end with its object, or the normalizer has no units to fuse parts by.
+    """
+    costs = []
+    for episode in episodes:
+        goal = goal_at_every_frame(ends.for_trajectory(episode, "the successes that are fitted"))
+        curves = compute_curves(episode, goal, normalizer, value).costs
+        if FUSED not in curves:
+            raise UserError(
+                "a success threshold needs the parts of a cost: two fitted successes must share an "
+                "object"
+            )
+        costs.append(float(curves[FUSED][-1]))
+    return costs
+
+
+def check_demonstrations(demonstrations: int, rejected: float = REJECTED) -> None:
     """Raise UserError if a bound needs more demonstrations."""
     if not 0 < rejected < 1:
         raise UserError(f"the share of rejected successes is {rejected:g}; it must be in (0, 1)")
@@ -75,12 +105,14 @@ def check_demonstrations(demonstrations: int, rejected: float) -> None:
         )
 
 
-def load_success_threshold(normalizer: Path) -> SuccessThreshold | None:
-    """Return the threshold beside a normalizer's file; None if there is none.
+def load_success_threshold(normalizer: str | Path | None) -> SuccessThreshold | None:
+    """Return the threshold beside a normalizer's file; None if there is none, or no such file.
 
     UserError: the file is no threshold.
     """
-    path = normalizer.with_name(SUCCESS)
+    if normalizer is None or not Path(normalizer).is_file():
+        return None
+    path = Path(normalizer).with_name(SUCCESS)
     if not path.is_file():
         return None
     try:

@@ -14,24 +14,25 @@ def test_rejected_successes_stay_within_the_bound(demonstrations: int, bound: fl
     """Over exchangeable costs of any distribution, the bound holds and is not wasted."""
     rng, trials = np.random.default_rng(0), 4000
     costs = rng.gamma(0.5, size=(trials, demonstrations + 1))
-    rejected = [not fit_success(row[1:].tolist(), "fused", bound).accepts(row[:1]) for row in costs]
+    rejected = [not fit_success(row[1:].tolist(), bound).accepts(float(row[0])) for row in costs]
     sigma = np.sqrt(bound * (1 - bound) / trials)
     assert bound - 1 / (demonstrations + 1) - 3 * sigma < np.mean(rejected) < bound + 3 * sigma
 
 
 def test_too_few_demonstrations_are_refused() -> None:
     with pytest.raises(UserError, match="reject at most 10% .* at least 9 demonstrations .*are 8"):
-        fit_success([0.1] * 8, "fused", 0.1)
+        fit_success([0.1] * 8, 0.1)
     with pytest.raises(UserError, match="at least 19 demonstrations"):
-        fit_success([0.1] * 18, "fused", 0.05)
+        fit_success([0.1] * 18, 0.05)
     with pytest.raises(UserError, match="must be in"):
-        fit_success([0.1] * 18, "fused", 0.0)
+        fit_success([0.1] * 18, 0.0)
 
 
 def test_stored_beside_the_normalizer(tmp_path: Path) -> None:
     normalizer = tmp_path / "normalizer.json"
-    assert load_success_threshold(normalizer) is None
-    threshold = fit_success(np.linspace(0, 1, 9).tolist(), "fused")
+    normalizer.touch()
+    assert load_success_threshold(normalizer) is None and load_success_threshold("none") is None
+    threshold = fit_success(np.linspace(0, 1, 9).tolist())
     threshold.save(tmp_path / SUCCESS)
     assert load_success_threshold(normalizer) == threshold
     assert "at most 1.000; it rejects at most 10% of successes like its 9" in str(threshold)

@@ -15,7 +15,9 @@ from touchgoal.rewards.report.frame_table import PROGRESS, write_frames, write_p
 from touchgoal.rewards.report.outcome_table import outcome_table
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.record import Facts, columns_of, load_facts
+from touchgoal.rewards.report.success_table import success_table
 from touchgoal.rewards.report.summary import metrics_table
+from touchgoal.rewards.success import SuccessThreshold
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.json_file import write_json
 
@@ -46,8 +48,19 @@ def write_report(
     return paths
 
 
-def report_all(records: Sequence[Path], out: Path, provenance: Mapping[str, Any]) -> None:
-    """Write the reports of all records: metrics, tables for LeRobot, pages; print the tables."""
+def report_all(
+    records: Sequence[Path],
+    out: Path,
+    provenance: Mapping[str, Any],
+    threshold: SuccessThreshold | None = None,
+    audit: str = "",
+) -> None:
+    """Write the reports of all records: metrics, tables for LeRobot, pages; print the tables.
+
+    Args:
+        threshold: what counts as success, if that is known.
+        audit: table of the touch-use audit; "" without one.
+    """
     facts = [load_facts(path) for path in records]
     write_metrics(facts, out)
     write_frames(records, facts, out, provenance)
@@ -56,6 +69,10 @@ def report_all(records: Sequence[Path], out: Path, provenance: Mapping[str, Any]
     tables = [metrics_table(facts)]
     if any(one.outcome for one in facts):
         tables.append(outcome_table(facts))
+    if threshold is not None:
+        tables.append(success_table(facts, threshold, out))
+    if audit:
+        tables.append(audit)
     page = write_pages(records, facts, out, tables[1:])
     print("\n\n".join(tables))
     if not facts[0].normalised:

@@ -35,6 +35,7 @@ from touchgoal.benchmarks.papers.reward_quality.recording import (
     record,
 )
 from touchgoal.rewards.audit import audit_touch
+from touchgoal.rewards.distance.parts import FUSED
 from touchgoal.rewards.report.summary import metrics_table
 from touchgoal.rewards.success import check_demonstrations, fit_success
 from touchgoal.runtime.option_types import Count, checked_dataclass
@@ -44,7 +45,6 @@ TRUE_KINDS = tuple(kind for kind in KINDS if kind != "overgripped")
 """Kinds whose mean is judged. 40 N cannot be seen where the demonstrations differ in force: it has
 the line of the force."""
 _ON_DIAGONAL = 8  # objects
-_REJECTED = 0.1  # bound on rejected successes
 _AUDITED = ("success", "drop", "wrong_object")
 
 
@@ -78,7 +78,7 @@ class Config(BenchmarkOptions):
 
 def run(config: Config) -> dict[str, Any]:
     """Record, embed, measure and judge."""
-    check_demonstrations(config.calibration, _REJECTED)
+    check_demonstrations(config.calibration)
     if config.out is not None:
         return _run(config, config.out)
     with tempfile.TemporaryDirectory() as folder:
@@ -178,9 +178,9 @@ def _threshold(
 ) -> tuple[Any, dict[str, float]]:
     """Return the success threshold, and the share of each outcome that it accepts."""
     calibration = judge.judge([r for r in recorded if r.purpose == "calibration"])
-    threshold = fit_success([e.last("fused") for e in calibration], "fused", _REJECTED)
+    threshold = fit_success([e.last(FUSED) for e in calibration])
     return threshold, {
-        outcome: float(np.mean([threshold.accepts(e.costs["fused"]) for e in episodes]))
+        outcome: float(np.mean([threshold.accepts(e.last(FUSED)) for e in episodes]))
         for outcome, episodes in judged.items()
     }
 
