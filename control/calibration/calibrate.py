@@ -43,7 +43,7 @@ class FittedCalibration:
     circles: Circles  # of the fitted presses, moved to their pictures, px
     # of the fitted presses, m; unknown ones are fitted, but pictures determine them poorly
     ball_radius: Float[np.ndarray, " n"]
-    varies_over_image: bool  # whether the response does; not if all presses lie in one place
+    varies_over_image: bool  # whether the response varies; not if all presses lie in one place
     # label_offset, label_slope: true centre x, centre y and radius (px) are about offset + slope x
     # label
     label_offset: Circle

@@ -36,9 +36,9 @@ class WandRecorder:
 
     Attributes:
         hint: for the person who presses.
-        force: in free air 0, N.
+        force: on the gel, N; 0 in free air.
         counts: touches in each of the paper's ranges of force.
-        wear: of the gel when it was last seen untouched.
+        wear: wear of the gel when it was last seen untouched.
     """
 
     def __init__(

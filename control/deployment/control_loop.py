@@ -25,8 +25,8 @@ from touchgoal.control.safety.action_filter import ActionFilter, Limit, Measurem
 from touchgoal.runtime.errors import UserError
 
 _REST_SPEED = 0.01  # rad/s
-_REST_TIMEOUT = 3.0  # s to wait for that by the loop's clock
-_REST_WALL_TIMEOUT = 10.0  # s on the wall for the same
+_REST_TIMEOUT = 3.0  # s to wait for rest, by the loop's clock
+_REST_WALL_TIMEOUT = 10.0  # s of wall time to wait for rest
 SLOW_ARM = 0.95  # share of real time below which an arm's clock means a twin that cannot keep up
 
 ADVICE = {

@@ -9,7 +9,7 @@ from touchgoal.control.motion.tool import Tool
 _CONFIRMING = 2  # readings in a row that must agree before an object counts as held
 _SLIPPED = 0.003  # m that the fingers close further when the object is gone
 _LIFTED = 0.005  # m above where it was grasped: no longer carried by the table
-_MOVES = 0.001  # m between widths of a moving hand
+_MOVES = 0.001  # m, least change of width between readings of a moving hand
 _CLOSING_ERROR = 0.003  # m above the commanded width at which a closed hand may stand
 # Share of the stroke that an open hand may stand below the command: one that was homed with
 # fingertips mounted does not open as far as its model.

@@ -87,7 +87,7 @@ class RealTimeActor(Actor):
         self._timeout = half if timeout is None else timeout
         self._tick = self._embedded = -1
         self._history: list[Observation] = []
-        self._request: _Request | None = None  # for a plan that is not there yet
+        self._request: _Request | None = None  # for the plan that is being made
         self._lead = 0  # ticks between a plan's observation and the first tick that it is meant for
         self._plan: _Plan | None = None
         self._width = 0.0

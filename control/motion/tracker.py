@@ -3,8 +3,8 @@ path.
 
 A reference walks in straight lines from target to target, each within the policy's period, or
 slower where it would turn faster than the limits allow. The command is the reference's mean over a
-short window: it stays in the reference's range and delays all joints alike. It cuts corners, by how
-much says `touchgoal benchmark sent-stream`.
+short window: it stays in the reference's range and delays all joints alike. It cuts corners;
+`touchgoal benchmark sent-stream` measures by how much.
 """
 
 from dataclasses import dataclass, replace

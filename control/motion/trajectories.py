@@ -18,11 +18,11 @@ from touchgoal.control.motion.rotations import Matrix3, Vector3, rotation_matrix
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.runtime.errors import UserError
 
-_DEGREE = 16  # of a straight line's joints; 0.4 m are then straight within 0.1 mm
+_DEGREE = 16  # degree of a straight line's path; 0.4 m are then straight within 0.1 mm
 _STRAIGHT = 5e-4  # m off the line that are refused
 _SAMPLES = 1001  # times at which a move is compared with the limits
-# For peaks between those, and because a controller holds the speed over a millisecond against the
-# taper at its end, up to 0.3 % lower.
+# Margin for peaks between these times, and for a taper limit that falls by up to 0.3 % within the
+# millisecond for which a controller holds a speed.
 _SLACK = 1.005
 # Shares of full speed and of full braking that are tried where full ones would break a limit.
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2)

@@ -50,7 +50,8 @@ class VideoConfig:
     frozen_pictures: int = 0
     gel: bool = False  # a fingertip's: smooth but for its dots, so broken pictures show
     dots: float = 0.0  # diameter of the printed dots as a share of the picture's diagonal; 0: none
-    device: Callable[[], str] | None = None  # finds it at each opening, if `source` is a serial nr.
+    # looks `source` up at each opening, for a serial number
+    device: Callable[[], str] | None = None
 
     @property
     def is_camera(self) -> bool:

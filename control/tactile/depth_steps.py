@@ -64,7 +64,7 @@ def best_slopes(left, error, gx, gy, gain, places, coefficients, lengths, outlie
         lengths: of the normal's part in the image plane to try.
         outlier: squared error that starts a search, counts^2.
         tilted: squared slope below which the direction is noise.
-        better: share of the squared error that other slopes may leave to be taken.
+        better: other slopes are taken if they leave at most this share of the squared error.
     """
     h, w = gx.shape
     waves, terms = len(places), np.ones(10, np.float32)

@@ -16,10 +16,10 @@ from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.markers import find_markers, without_markers
 from touchgoal.control.tactile.sensor_models import SensorModel
 
-# Strength of a change: counts, and multiple of the picture's median. Between untouched pictures of
-# one gel the strongest is 1.0 and 3.9 times the usual in simulation (single frames, light changed by
-# 5 %). Of 408 pairs of real videos in a row (PhysiCLeAR, medians of 5 compressed frames) 22 exceed both:
-# dust and scratches that came between them, and the corners of the case.
+# Strength of a change: counts, and multiple of the picture's median. Between untouched pictures of one
+# gel the strongest change in simulation is 1.0 counts and 3.9 times the median (single frames, light
+# changed by 5 %). Of 408 pairs of real videos in a row (PhysiCLeAR, medians of 5 compressed frames) 22
+# exceed both: dust and scratches that came between them, and the corners of the case.
 _LEAST, _TIMES_USUAL = 2.5, 6.0
 _BORDER = 16  # 1/n of each side is left out: there the case's edge shines
 _SPOT = 0.4  # share of the strongest change above which adjacent pixels belong to the spot

@@ -17,8 +17,8 @@ GAIN_SPREAD = 0.047
 """Standard deviation of a channel's brightness between 150,000 real touches of Minis (Tactile-MNIST)."""
 LARGE_CHANGE = 2 * GAIN_SPREAD
 """Change of a channel's brightness beyond what training has shown, as a share."""
-_ROWS = 32  # of cells that a picture is compared in; 30 x 40 at 240 x 320
-_DARK, _BRIGHT = 16.0, 250.0  # counts below which noise counts, and above which pixels clip
+_ROWS = 32  # rows of cells in a picture, at most; 30 x 40 cells at 240 x 320
+_DARK, _BRIGHT = 16.0, 250.0  # counts below which noise matters, and above which pixels clip
 _LEAST_CELLS = 0.05  # least share of usable cells for a channel's gain to be measured
 _LEAST_GAIN = 0.04  # gain of an almost black picture
 

@@ -1,8 +1,8 @@
 """Matching of a dot grid with the spots of the next frame, through jumps of half a spacing.
 
-On a lattice the nearest spot is a neighbour's from half a spacing on, for all dots at once. So the
-dots first move together: an affine map, fitted robustly from several starts, carries the grid, and
-what is left is matched dot by dot. The start that leaves fewest dots and spots over wins.
+On a lattice, once the dots move by half a spacing, the nearest spot of each is its neighbour's. So
+the dots first move together: an affine map, fitted robustly from several starts, carries the grid,
+and what is left is matched dot by dot. The start that leaves fewest dots and spots over wins.
 """
 
 from collections.abc import Iterator

@@ -94,11 +94,11 @@ GELSIGHT_MARKERS = replace(
 )
 
 # Image: QVGA at 60 Hz, upright as digit-interface returns it. Sensor file: one unit fitted to 20
-# presses of one ball (FOTS); ball (3 mm) and scale are assumed, neither is stated and pictures do
-# not tell. Sources range from 0.0405 (gs_sdk, at VGA) over 0.0511 (FOTS) to 0.0667 (a 16 x 19 mm
-# sensing field). Case 32.3 x 27 x 34 mm: its STL. Gel 20 x 30 mm: TACTO, which also bends it by 5
-# mm (R 100 mm); flat here. Thickness and moduli are not published: a third thinner than the Mini's,
-# of the same silicone.
+# presses of one ball (FOTS); ball (3 mm) and scale are assumed, because no source states them and
+# pictures do not show them. Sources range from 0.0405 (gs_sdk, at VGA) over 0.0511 (FOTS) to 0.0667
+# (a 16 x 19 mm sensing field). Case 32.3 x 27 x 34 mm: its STL. Gel 20 x 30 mm: TACTO, which also
+# bends it by 5 mm (R 100 mm); flat here. Thickness and moduli are not published: a third thinner
+# than the Mini's, of the same silicone.
 DIGIT = SensorModel(
     name="digit",
     image_shape=(320, 240),

@@ -215,7 +215,7 @@ class DeployedArm:
 
 
 def measurements_at_rest(q: Joints) -> Measurements:
-    """Return measurements at which the safety layer clamps but never stops: the task stops."""
+    """Return measurements at which the safety layer clamps but never stops: the env does."""
     return Measurements(
         q=q,
         force=np.zeros(3),

@@ -97,7 +97,8 @@ class SimulatedHardware(ABC):
     def contact_force(self) -> Float[np.ndarray, "3"]:
         """Return the robot's contact force (N) in the last step, base frame; 0 if small.
 
-        A reading takes as long as a physics step, so it needs more than `_QUIET` on some joint.
+        Contacts are read, which takes as long as a physics step, only if a joint bears over
+        `_QUIET`.
         """
         if np.abs(self.data.qfrc_constraint[self.arm_dofs]).max() < _QUIET:
             return np.zeros(3)

@@ -14,8 +14,7 @@ from touchgoal.sim_envs.tactile.geometry import Grid
 DARKNESS = 0.7  # share of the light taken, a guess: print on a lit gel is not black
 # Friction holds the gel under an object. Under a stuck ball the gel spreads by 10 % of the
 # frictionless amount in the middle, 60 % at the rim and 80 % outside: the share falls with the
-# local pressure. (The layer solved in steps of a growing contact, ball radius 5 to 25 mm, 1 to 15
-# N.)
+# local pressure. (From the layer solved for a growing contact, ball radius 5 to 25 mm, 1 to 15 N.)
 _FREE = 0.8
 
 
@@ -128,9 +127,8 @@ def _move(normal, tangential, responses, patch, stiffness, here, out):
 class GelMotion:
     """Displacement of points on a gel's surface under the forces of a contact.
 
-    MuJoCo's gel shears as one plate. Shear is scaled so that a traction shaped like the pressure
-    moves
-    the patch, on the average over the pressure, as far as it moves the plate.
+    MuJoCo's gel shears as one plate. Shear is scaled so that a traction proportional to the
+    pressure moves the patch, in the pressure-weighted mean, as far as the plate.
     """
 
     def __init__(self, sensor: SensorModel, grid: Grid, points: Float[np.ndarray, "n 2"]) -> None:

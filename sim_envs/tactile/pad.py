@@ -53,10 +53,9 @@ class TactileFrame:
 class TactilePad:
     """One fingertip's sensor in a compiled model.
 
-    The solver gives the pad's force and its place, geometry the contact's shape, in the frame of
-    the
-    sensor's case, so that shear moves the contact in the image. Stick and slip have a memory: read
-    frames in order of time.
+    The solver gives the pad's force and position. Geometry gives the contact's shape, in the frame
+    of the sensor's case, so that shear moves the contact in the image. Stick and slip depend on
+    earlier frames: read frames in order of time.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ from touchgoal.sim_envs.twin.ur.controller import UrController
 
 _MAX_BACKLOG = 0.1  # s behind real time beyond which the twin stops trying to catch up
 # s to wait for a client that drives the arm. In lock-step for as long as a loaded machine needs; in
-# real time about as long as a busy one hiccups.
+# real time about as long as a busy one stalls.
 _LOCK_STEP_TIMEOUT, _CLIENT_TIMEOUT = 2.0, 0.1
 _RUN_SECONDS = 40.0
 
