@@ -37,8 +37,8 @@ def find_faults(
 ) -> dict[int, str]:
     """Return the first fault of each faulty episode, with its frame.
 
-    Only these keys are checked, all by default, and of touchgoal's own sets nothing: its writer
-    refuses such episodes, and checksums cover the rest.
+    Checks these keys, by default all. Touchgoal's own sets are not checked: its writer refuses such
+    episodes, and checksums cover the rest.
     """
     if not episodes.foreign:
         return {}

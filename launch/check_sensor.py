@@ -25,9 +25,9 @@ class Config:
     """Corners of the gel in the camera's picture, x and y in px: top left, top right, bottom left, bottom
     right; for a camera that sees its gel at an angle (gelsight_wedge)."""
     ball_mm: Positive | None = None
-    """Radius of the ball that presses, mm: what the depth shows is compared with it."""
+    """Radius of the pressed ball, mm, to compare with the radius that the depth shows."""
     weight_g: Positive | None = None
-    """Weight that lies on the gel, g: the force that the pictures show is compared with it."""
+    """Weight on the gel, g, to compare with the force that the pictures show."""
     exposure: Positive | None = None
     """Exposure to lock, in the camera's units; default: as it is set."""
     seconds: Positive = 20.0

@@ -27,7 +27,7 @@ class Config:
     sensor: str = "gelsight_mini"
     """Model of the sensor (`touchgoal list sensors`)."""
     exposure: Positive | None = None
-    """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); a device needs it."""
+    """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); needed for a local camera."""
     white_balance: Annotated[int, Field(ge=1000, le=15_000)] | None = None
     """White balance to lock, K; default: as it is set."""
     corners: Corners | None = None

@@ -44,8 +44,8 @@ _FLOOR = -0.02  # m, lower bound of the box here, so that the table can be press
 _DELAY = 0.005  # s from a command to the arm: half of the two streams' periods
 _WAVE_SECONDS, _WAVE = 2.0, 0.012  # s, and rad a tick at most
 _ABOVE = 0.005  # m of the fingers' lowest corner above the table where it slows down
-_PRESSED = -5e-4  # m, the same as commanded at the end
-_DOWN, _PRESS, _HOLD = 2.5, 2.5, 0.5  # s; faster, and the arm's reflex would end it
+_PRESSED = -5e-4  # m, commanded height of that corner at the end
+_DOWN, _PRESS, _HOLD = 2.5, 2.5, 0.5  # s; a faster press would trigger the reflex
 _TOUCHING = 1.0  # N
 
 

@@ -26,7 +26,7 @@ class Config(BenchmarkOptions):
     """Options of benchmark task-ceilings."""
 
     data: Path = field(kw_only=True)
-    """Folder of episodes of the expert or a teleoperator; the ceiling of touch needs its images."""
+    """Folder of an expert's or teleoperator's episodes; the gel's ceiling needs tactile images."""
 
 
 def peak_force(episode: Episode) -> float:

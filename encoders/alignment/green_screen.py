@@ -42,7 +42,7 @@ def screen_chromaticity(picture: Picture) -> Shares | None:
 
 
 def foreground(picture: Picture, known: Shares | None = None) -> Alpha:
-    """Return how much of each pixel stands before the screen, 0 to 1.
+    """Return the foreground's share of each pixel, 0 to 1.
 
     Args:
         picture: RGB.

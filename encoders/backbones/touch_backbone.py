@@ -77,7 +77,7 @@ class BaseTouchEncoder(nn.Module):
 
     @torch.no_grad()
     def embed_text_goal(self, texts: list[str], towers: Towers) -> Float32[np.ndarray, "n d"]:
-        """Embed sentences among touches, to be compared with `embed_frames`.
+        """Embed sentences as touch embeddings, to compare with `embed_frames`.
 
         UserError: the encoder was trained with other towers.
         """

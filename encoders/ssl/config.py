@@ -1,4 +1,4 @@
-"""Options of self-supervised objectives; light to import, for `touchgoal --help` shows them.
+"""Options of self-supervised objectives; light to import, because `touchgoal --help` shows them.
 
 The `paper` presets are Sparsh's Table 2 (Higuera et al. 2024); what it leaves open is as in the
 released code, see each objective. The predictors' sizes are those of the released code.

@@ -40,9 +40,9 @@ def train_unlabelled(
 ) -> TouchBackbone:
     """Train a backbone by the objective of `config`.
 
-    Writes what `trainer.fit` does, and at the end the backbone, or its teacher, to `encoder/`.
-    Killed and resumed, it ends with the same weights as uninterrupted. Returns the backbone as
-    saved, for inference, on the CPU. UserError: no such device, a folder that does not fit
+    Writes what `trainer.fit` does, and at the end the backbone, or its teacher, to `encoder/`. A
+    killed and resumed run ends with the same weights as an uninterrupted one. Returns the backbone
+    as saved, for inference, on the CPU. UserError: no such device, a folder that does not fit
     `options.resume`, or a collapsed encoder, which is not saved.
 
     Args:

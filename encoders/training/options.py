@@ -1,4 +1,4 @@
-"""Options of every training command; light to import, for `touchgoal --help` shows them."""
+"""Options of every training command; light to import, because `touchgoal --help` shows them."""
 
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,7 +1,7 @@
 """Within-surface covariance of touch features, estimated on simulated presses.
 
-What differs between presses of one surface does not matter; the inverse square root of its
-covariance makes distances that ignore it (Hatch et al. 2006).
+Variation between presses of one surface is a nuisance; the inverse square root of its covariance
+gives distances that ignore it (Hatch et al. 2006).
 """
 
 from collections.abc import Iterator

@@ -1,8 +1,8 @@
 """Sentences on how a random surface feels: roughness and bumpiness, from its height map.
 
 The ranks are PhysiCLeAR's. Hardness has no words here: the softness of a random surface says little
-about its real tactile image, and such words did harm (hardness of real objects at chance, accuracy
-on seen objects from 0.80 to 0.59).
+about its real tactile image, and such words did harm (hardness of real objects was at chance,
+accuracy on seen objects fell from 0.80 to 0.59).
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from touchgoal.encoders.whitening.text_head import RANK_WORDS
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, TILE_PITCH, Surface
 
 _FINE = 1.5e-3  # m, wavelength: finer texture is roughness, coarser is bumps
-# um, standard deviations of the fine and of the coarse part of a texture, between the three ranks: a gel
+# um: thresholds between the ranks, for the standard deviation of the fine and the coarse part: a gel
 # shows 3 um of fine relief faintly, and 12 um plainly.
 _ROUGH, _BUMPY = (3.0, 12.0), (10.0, 50.0)
 

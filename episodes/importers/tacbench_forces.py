@@ -9,9 +9,8 @@ Forces are in newtons: Sparsh divides them by 4, 4 and 5 N. The third is normal 
 stated and is taken so that pressing is positive. The image directions of the first two are not stated.
 
 GelSight images are stored upright, 320 high, and are turned back counter-clockwise here. One batch
-(sharp/batch_2) has red and blue exchanged: its untouched gel is bluer than red, the others' redder, by
-which any such batch is recognised. Whether the Mini's gel has dots is unknown (name
-`gelsight_mini_markers` if so).
+(sharp/batch_2) has red and blue exchanged. Such a batch is recognised by an untouched gel with more
+blue than red. Whether the Mini's gel has dots is unknown (name `gelsight_mini_markers` if so).
 """
 
 import re

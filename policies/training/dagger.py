@@ -40,7 +40,7 @@ class DaggerRoles:
         if isinstance(self.policy, SavedPolicy) and isinstance(env, PickPlace):
             network = self.policy.network()
             if network.config.estimated:
-                return LearnedPolicy(network, None, _NearlyTrueState(env), env.plan_ticks), expert
+                return LearnedPolicy(network, None, _NoisyTruth(env), env.plan_ticks), expert
         return self.policy(env), expert
 
 
@@ -68,7 +68,7 @@ def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> Dagger
     return DaggerRoles(maker)
 
 
-class _NearlyTrueState:
+class _NoisyTruth:
     """The simulator's truth, with an error that stays for an episode as a pose estimator's does."""
 
     def __init__(self, env: PickPlace) -> None:
