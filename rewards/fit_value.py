@@ -13,8 +13,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
 LEAST_EPISODES = 4
-_STEPS, _BATCH = 600, 128
-_LEARNING_RATE, _WEIGHT_DECAY = 3e-3, 0.1
+_STEPS, _BATCH = 400, 128
+_LEARNING_RATE, _WEIGHT_DECAY = 3e-3, 1.0  # unseen objects: mean error .064, with 0.1 .065
 _STRIDE = 2  # every second frame is trained on: neighbours look alike
 
 
