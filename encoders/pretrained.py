@@ -48,12 +48,18 @@ def save(
     ENCODER_FORMAT.save(directory, weights, config, provenance)
 
 
-def shipped_encoder_for(sensor: str | None) -> Path:
+def shipped_encoder_for(sensor: str | None, words: bool = True) -> Path:
     """Return the shipped encoder for a sensor, on the offline towers; the default one for None.
+
+    Without `words` it is the one that tells surfaces apart, where there is one: it recognises real
+    objects better than those aligned with texts in simulation (`benchmark real-touch`).
 
     Raises:
         UserError: None ships.
     """
+    surfaces = _WEIGHTS / f"{sensor}_surfaces"
+    if not words and surfaces.is_dir():
+        return surfaces
     directory = _WEIGHTS / f"{sensor}_offline" if sensor else DEFAULT_ENCODER
     if not directory.is_dir():
         raise UserError(f"no touch encoder ships for {sensor}: {ENCODER_FORMAT.remedy}")

@@ -7,7 +7,7 @@ import numpy as np
 
 from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE, TACTILE_LEFT, TACTILE_RIGHT
 from touchgoal.encoders.preprocess import check_images
-from touchgoal.encoders.pretrained import DEFAULT_ENCODER, AnyTouchEncoder
+from touchgoal.encoders.pretrained import AnyTouchEncoder, shipped_encoder_for
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.touches import touch_background
@@ -94,7 +94,7 @@ def reward_curve(
     goals = list(goal) if isinstance(goal, list | tuple) else [goal]
     specs = [spec for one in goals for spec in _as_specs(one, episode)]
     if encoder is None and inputs.sides:
-        encoder = DEFAULT_ENCODER
+        encoder = shipped_encoder_for("gelsight_mini", any(isinstance(s, Sentence) for s in specs))
     model = load_reward_model(inputs, specs, encoder, towers, normalizer, device)
     return model.curves(model.embedder.embed_episode(episode, fps, inputs.name))
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -37,10 +38,14 @@ class CostMeter:
     ticks so far, while a recording's is always that of its first five.
     """
 
-    def __init__(self, model: RewardModel) -> None:
+    def __init__(self, model: RewardModel, object_name: str = "", rate: float = CONTROL_HZ) -> None:
         """Prepare for one run, to goals from outside it; without a normalizer, of one modality.
 
         UserError: a goal that is known only at the end, or raw distances of several modalities.
+
+        Args:
+            object_name: object of the run, which chooses among the goals; "" if unknown.
+            rate: ticks a second.
         """
         if model.goal.same_episode:
             raise UserError("task.rewards: last and frame:K are not known before the end")
@@ -50,6 +55,7 @@ class CostMeter:
                 "goal of one modality (image:PATH or text:SENTENCE), or a normalizer"
             )
         self._model, self._embedder = model, model.embedder
+        self._object, self._rate = object_name, rate
         self._goal: EmbeddedGoal | None = None
         self._stream: FeatureStream | None = None
         self._background_ticks = 0  # that the stream's background is the median of
@@ -65,9 +71,9 @@ class CostMeter:
         if self._stream is None or len(first) > self._background_ticks:
             before = [tick for tick in first if tick is not observation]
             ticks = [*before, observation]
-            self._stream = self._embedder.stream(_stacked(first), CONTROL_HZ, "this run")
+            self._stream = self._embedder.stream(_stacked(first), self._rate, "this run")
             self._background_ticks, self._parts = len(first), {}
-        trajectory = self._stream.embed(_stacked(ticks))
+        trajectory = replace(self._stream.embed(_stacked(ticks)), object=self._object)
         if self._goal is None:
             self._goal = self._embedder.embed_goal(self._model.goal, trajectory)
         model = self._model
@@ -140,4 +146,4 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
     model = load_reward_model(
         inputs, goals, task.encoder or None, normalizer=task.normalizer or None
     )
-    return OnlineCost(CostMeter(model))
+    return OnlineCost(CostMeter(model, task.objects[0] if len(task.objects) == 1 else ""))

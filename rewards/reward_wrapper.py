@@ -1,0 +1,101 @@
+"""The cost to a goal as the reward of a Gymnasium environment."""
+
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+
+from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE, Observation
+from touchgoal.rewards.curves import GAMMA
+from touchgoal.rewards.goals import Inputs
+from touchgoal.rewards.metrics import START_FRAMES
+from touchgoal.rewards.online import CostMeter
+from touchgoal.rewards.reward_model import RewardModel
+from touchgoal.runtime.errors import UserError
+
+
+def inputs_of(env: gym.Env) -> Inputs:
+    """Return what is known about an environment's observations, for `load_reward_model`.
+
+    Its `sensor`, with a name, and `task` count if it has them, as touchgoal's environments do.
+    """
+    space = env.observation_space
+    keys = set(space) if isinstance(space, gym.spaces.Dict) else set()
+    sensor, task = (getattr(env.unwrapped, name, None) for name in ("sensor", "task"))
+    return Inputs(
+        name="the environment",
+        camera=FRONT if FRONT in keys else None,
+        sides=tuple(key for key in TACTILE if key in keys),
+        sensor=getattr(sensor, "name", None),
+        scene=f"simulated {task}" if task else "unknown",
+        cameras=tuple(key for key in CAMERAS if key in keys),
+        task=str(task or ""),
+    )
+
+
+class TouchReward(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
+    """Replaces an environment's reward by one from the cost to a goal outside the episode.
+
+        env = touchgoal.make("pick-place")
+        goal = parse_goal("goal:runs/fit/goal.npz")
+        model = load_reward_model(inputs_of(env), [goal], normalizer="runs/fit/normalizer.json")
+        env = TouchReward(env, model)
+
+    The potential form pays the fall of the cost, cost_before - gamma cost, so that holding still
+    pays nothing with gamma 1 and a path is paid by its ends; the state form pays -cost. `info` has
+    the `cost` and the environment's own reward as `task_reward`. An end is not set to zero.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        model: RewardModel,
+        form: Literal["potential", "state"] = "potential",
+        gamma: float = GAMMA,
+    ) -> None:
+        """Wrap an environment whose observations have touchgoal's keys.
+
+        UserError: another sensor or camera than the model's, or a goal inside the episode.
+
+        Args:
+            gamma: discount a second of the potential form. An algorithm that discounts by g a step
+                wants g to the power of the steps a second.
+        """
+        super().__init__(env)
+        inputs, made_with = inputs_of(env), model.embedder.made_with
+        if inputs.sensor and made_with.sensor and inputs.sensor != made_with.sensor:
+            raise UserError(
+                f"the reward is for the sensor {made_with.sensor}, the environment has "
+                f"{inputs.sensor}: load a model for inputs_of(env)"
+            )
+        if model.goal.image is not None and model.embedder.camera not in inputs.cameras:
+            raise UserError(f"the environment has no camera {model.embedder.camera}: add it")
+        rate = getattr(getattr(env.unwrapped, "config", None), "control_hz", CONTROL_HZ)
+        self._model, self._form, self._gamma = model, form, gamma ** (1 / rate)
+        self._rate = float(rate)
+        self._meter = CostMeter(model)
+        self._first: list[Observation] = []
+        self._cost = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode, whose first observations must be free of contact."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._meter = CostMeter(self._model, str(info.get("object", "")), self._rate)
+        self._first = []
+        self._cost = self._measure(observation)
+        return observation, {**info, "cost": self._cost}
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Run one step; see the class for the reward."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        before, self._cost = self._cost, self._measure(observation)
+        info = {**info, "cost": self._cost, "task_reward": reward}
+        paid = before - self._gamma * self._cost if self._form == "potential" else -self._cost
+        return observation, paid, terminated, truncated, info
+
+    def _measure(self, observation: Observation) -> float:
+        if len(self._first) < START_FRAMES:
+            self._first.append(observation)
+        return self._meter.measure(observation, self._first)
