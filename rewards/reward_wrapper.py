@@ -73,7 +73,7 @@ class TouchReward(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray])
         rate = getattr(getattr(env.unwrapped, "config", None), "control_hz", CONTROL_HZ)
         self._model, self._form, self._gamma = model, form, gamma ** (1 / rate)
         self._rate = float(rate)
-        self._meter = CostMeter(model)
+        self._meter = CostMeter(model, rate=self._rate)
         self._first: list[Observation] = []
         self._cost = 0.0
 

@@ -3,8 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from test_episode_embedder import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, WRIST
 from touchgoal.control.tactile.sensor_models import SENSORS
@@ -28,6 +30,9 @@ from touchgoal.rewards.features.embedded import (
 )
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.fit_value import fit_value
+from touchgoal.rewards.goals import Goal, GoalPicture, OwnFrame
+from touchgoal.rewards.reward_model import load_reward_model
+from touchgoal.rewards.reward_wrapper import TouchReward, inputs_of
 from touchgoal.rewards.value import Value
 from touchgoal.runtime.errors import UserError
 
@@ -224,3 +229,45 @@ def test_ends_are_a_goal_that_is_saved_and_chosen_by_object(
     (tmp_path / "goal.npz").write_text("no file")
     with pytest.raises(UserError, match="is no goal file"):
         SuccessfulEnds.load(tmp_path / "goal.npz")
+
+
+class _Reaching(gym.Env):
+    """A bright square that moves right, one step each; nothing touches the fingertips."""
+
+    observation_space = gym.spaces.Dict({FRONT: gym.spaces.Box(0, 255, (32, 32, 3), np.uint8)})
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def _see(self) -> dict[str, np.ndarray]:
+        picture = np.full((32, 32, 3), 60, np.uint8)
+        picture[12:20, self.at : self.at + 8] = 200
+        return {FRONT: picture}
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple:
+        super().reset(seed=seed)
+        self.at = 0
+        return self._see(), {}
+
+    def step(self, action: np.ndarray) -> tuple:
+        self.at += int(action[0] > 0)
+        return self._see(), 7.0, False, False, {}
+
+
+def test_the_cost_rewards_an_environment() -> None:
+    """A step towards the goal pays what the cost falls by; holding still pays nothing."""
+    goal = _Reaching()
+    goal.reset()
+    goal.at = 12
+    env = _Reaching()
+    specs = [GoalPicture(goal._see()[FRONT])]
+    model = load_reward_model(inputs_of(env), specs, towers=PaintTowers(), normalizer="none")
+    rewarded = TouchReward(env, model)
+    _, info = rewarded.reset(seed=0)
+    paid = [rewarded.step(np.array([a]))[1] for a in (*[1.0] * 12, 0, 0, 0)]
+    assert sum(paid) == pytest.approx(info["cost"])
+    assert paid[12:] == [0, 0, 0]
+    by_state = TouchReward(env, model, form="state")
+    by_state.reset(seed=0)
+    _, reward, _, _, info = by_state.step(np.array([1.0]))
+    assert reward == -info["cost"] < 0 and info["task_reward"] == 7.0
+    with pytest.raises(UserError, match="not known before the end"):
+        TouchReward(env, replace(model, goal=Goal(image=OwnFrame())))

@@ -18,6 +18,7 @@ from torch import nn
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.benchmarks.real_touch.embedders import vit_of
 from touchgoal.benchmarks.speed.rates import in_turn, one_core
+from touchgoal.benchmarks.speed.reward_parts import parts_table, time_parts
 from touchgoal.encoders.backbones.frame_history import RecentFrames
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.backbones.sparsh import sparsh_vit
@@ -90,7 +91,9 @@ def run(config: Config) -> dict[str, Any]:
             _measure(name, encoders[name], precision, config)
             for name, precision in track(measured, "timing", "encoder")
         ]
-    return {"table": _table(rows, config), "rows": [asdict(row) for row in rows]}
+        parts = time_parts(config.repeats)
+    table = f"{_table(rows, config)}\n\n{parts_table(parts)}"
+    return {"table": table, "rows": [asdict(row) for row in rows], "reward_parts": parts}
 
 
 def _random(name: str) -> TouchBackbone:
