@@ -147,9 +147,10 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     writer = EpisodeWriter(folder / "episodes")
     frames = {k: v for k, v in EPISODE.frames.items() if k != TRUTH_CONTACT}
-    for success in (True, True, False):
+    for k, success in enumerate((True, True, False)):
         meta = {"sensor": "gelsight_mini", "success": success, "object": "cup"}
-        writer.append(replace(EPISODE, frames=frames, meta=meta))
+        seen = frames | {FRONT: frames[FRONT] + np.uint8(3 * k)}  # no two end alike
+        writer.append(replace(EPISODE, frames=seen, meta=meta))
     for i in range(2):
         write_video(folder / f"{i}.mp4", _stripes(i), 20)
     write_video(folder / "one.mp4", IMAGES[:1], 20)
