@@ -106,7 +106,7 @@ def main(config: Config) -> None:
     if done := len(measurement.records):
         print(f"{done:,} of {total:,} trajectories are measured in {out}")
     try:
-        measurement.run(config.workers)
+        speed = measurement.run(config.workers)
     except KeyboardInterrupt as interruption:
         kept = f"{len(measurement.records)} of {total} trajectories are measured"
         interruption.add_note(f"{kept}; the same command with --out {out} continues")
@@ -119,5 +119,5 @@ def main(config: Config) -> None:
     audited = source.trajectories[: config.audit]
     audit = audit_trajectories(audited, model_of).table if audited else ""
     report_all(measurement.records, out, model.provenance(), threshold, audit)
-    print(summary)
+    print(f"{summary}; {speed}")
     print(f"next: look at {out / PAGE}; train on {out / FRAMES}")

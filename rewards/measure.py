@@ -4,6 +4,8 @@ import csv
 import hashlib
 import io
 import json
+import resource
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,12 +56,13 @@ class Measurement:
         """Records of the measured trajectories, in the order of the source."""
         return [path for path in self._paths.values() if path.is_file()]
 
-    def run(self, workers: int) -> None:
+    def run(self, workers: int) -> str:
         """Measure what is missing; add what cannot be read to `skipped`.
 
-        Each trajectory is on disk when the next one begins. `workers` threads read ahead.
+        Each trajectory is on disk when the next one begins. `workers` threads read ahead. Return
+        number and rate of the frames and the largest memory, for people.
         """
-        done = 0
+        done, began = 0, time.perf_counter()
         with progress_bar("measuring", sum(t.length for t in self.missing), "frame") as bar:
             for trajectory, chunks in read_ahead(self.missing, workers):
                 try:
@@ -68,6 +71,10 @@ class Measurement:
                     self.skipped.append(Skipped(trajectory.name, str(error)))
                 done += trajectory.length
                 bar.update(done - bar.n)
+        seconds = time.perf_counter() - began
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6  # GB: Linux counts in kB
+        rate = f"{done / seconds:.1f} a second, at most {memory:.2f} GB of memory"
+        return f"{done:,} frames in {seconds:.0f} s: {rate}"
 
     def _measure(self, trajectory: Trajectory, chunks: Iterable[Episode]) -> None:
         model, name = self._models[trajectory.name], trajectory.name
