@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.rewards.goals import Inputs
 
-_CHUNK_BYTES = 128e6  # decoded frames in a chunk
+_CHUNK_BYTES = 48e6  # decoded frames in a chunk; a few chunks are in memory at once
 _FEWEST_FRAMES = 16  # in a chunk: the first one holds the frames that give the background
 
 
