@@ -217,6 +217,7 @@ def collect(
     metas, failures = [], Counter[str]()
     writer = EpisodeWriter(root, fps=config.control_hz)  # refuses a second recorder at once
     try:
+        check_fits(writer, config)
         with (
             one_core_workers(workers) as pool,
             progress_bar("recording", len(specs), "episode") as bar,
@@ -233,6 +234,16 @@ def collect(
     finally:
         writer.close()
     return metas
+
+
+def check_fits(writer: EpisodeWriter, config: TaskConfig) -> None:
+    """Raise UserError if a task's episodes would not fit the set that the writer continues."""
+    if len(writer):
+        env = make_env(config)
+        spaces = {**env.observation_space.spaces, ft.ACTION: env.action_space}
+        shapes = {key: space.shape or () for key, space in spaces.items()}
+        writer.check_fits(shapes, env.task)
+        env.close()
 
 
 def _failure(description: Description) -> str:

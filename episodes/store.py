@@ -30,7 +30,13 @@ from touchgoal.episodes.format.episode_table import EpisodePlace
 from touchgoal.episodes.format.foreign import foreign_file, refusal
 from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.episodes.format.repair import unlisted_files
-from touchgoal.episodes.keys import guess_keys, note_guess, readable_features, stored_names
+from touchgoal.episodes.keys import (
+    guess_keys,
+    keys_of_command,
+    note_guess,
+    readable_features,
+    stored_names,
+)
 from touchgoal.episodes.media import decode_video, video_checksum, video_length
 from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue
 from touchgoal.runtime.atomic_write import write_file
@@ -98,6 +104,16 @@ class EpisodeWriter:
         """Release the set for another writer."""
         self._lock.release()
 
+    def check_fits(self, shapes: Mapping[str, tuple[int, ...]], task: str) -> None:
+        """Raise UserError, before any work, if episodes to come would not fit an existing set.
+
+        Args:
+            shapes: Shape of every observation and of the action, a frame.
+            task: Name of the task, as in the meta of episodes.
+        """
+        if self._metadata is not None:
+            self._metadata.check_fits(self._root, shapes, task)
+
     def append(self, episode: Episode | EncodedEpisode) -> int:
         """Add an episode; when this returns, it is on disk.
 
@@ -140,8 +156,9 @@ class EpisodeSet:
         Args:
             root: Folder of the set, or of the run that recorded it into its `episodes/`.
             complete: Whether every file must be there; else `read` finds what is missing.
-            keys: New keys of features by their stored names. In a set that touchgoal did not write,
-                tactile images under other names are recognised without (noted on stderr).
+            keys: New keys of features by their stored names; None for those of the command
+                (`--keys`). In a set that touchgoal did not write, tactile images under other names
+                are recognised without (noted on stderr).
 
         Raises:
             UserError: Not a set, or of an unknown version; a metadata file is corrupt; a file is
@@ -154,7 +171,7 @@ class EpisodeSet:
         self.foreign = foreign_file(self.root, info["features"], table) is not None
         """Whether lerobot wrote, edited or continued the set; touchgoal does not change such a one."""
         features = readable_features(info["features"])
-        given = dict(keys or {})
+        given = keys_of_command(features) if keys is None else dict(keys)
         guessed = guess_keys(features) if self.foreign else {}
         if guessed := {k: v for k, v in guessed.items() if k not in given}:
             note_guess(self.root, tuple(guessed.items()))

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from touchgoal.runtime.option_types import CountOrNone, Seed, checked_dataclass
+from touchgoal.runtime.option_types import RARE, CountOrNone, Seed, checked_dataclass
 
 
 @checked_dataclass
@@ -31,7 +31,10 @@ class Config:
     """Number of successes, the last ones, that fit nothing else and set the threshold of success
     (success.json): at least 9, for at most 10 % of successes rejected. 0: no threshold."""
     camera: str = "front"
-    """Camera of the plain distance of images: front or wrist."""
+    """Camera of the plain distance of images, such as front, wrist or a LeRobot set's top."""
+    keys: Annotated[tuple[str, ...], RARE] = ()
+    """Keys of a LeRobot set whose features have other names: STORED=KEY, such as
+    observation.images.top=observation.images.front."""
     encoder: str | None = None
     """Touch encoder: a name (touchgoal list encoders), a folder, or a published Sparsh one. Default:
     the one that ships for the episodes' sensor. Sentences need one that is aligned with texts."""
@@ -50,6 +53,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, embed, fit, and write normalizer.json."""
+    from touchgoal.episodes.keys import use_keys
     from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
     from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
@@ -62,6 +66,7 @@ def main(config: Config) -> None:
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run
 
+    use_keys(config.keys)
     with_touch = config.towers is None or config.encoder is not None
     sources = open_successes(config.sources, config.camera, with_touch, config.assume_success)
     inputs = sources[0].inputs

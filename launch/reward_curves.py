@@ -16,7 +16,7 @@ from typing import Annotated
 import tyro
 from pydantic import Field
 
-from touchgoal.runtime.option_types import Count, CountOrNone, Positive, checked_dataclass
+from touchgoal.runtime.option_types import RARE, Count, CountOrNone, Positive, checked_dataclass
 
 
 @checked_dataclass
@@ -32,7 +32,11 @@ class Config:
     index: tuple[int, ...] = ()
     """Episodes of the set to measure, counted from 0. Default: all."""
     camera: str = "front"
-    """Camera of the episodes, or of videos whose name does not say it: front or wrist."""
+    """Camera of the episodes, such as front, wrist or a LeRobot set's top; or of videos whose name does
+    not say it: front or wrist."""
+    keys: Annotated[tuple[str, ...], RARE] = ()
+    """Keys of a LeRobot set whose features have other names: STORED=KEY, such as
+    observation.images.top=observation.images.front."""
     fps: Positive | None = None
     """Frames per second of folders of images. Default: 20."""
     encoder: str | None = None
@@ -62,6 +66,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, measure what is not measured yet, and write the reports."""
+    from touchgoal.episodes.keys import use_keys
     from touchgoal.rewards.audit import audit_trajectories
     from touchgoal.rewards.default_goal import goals_of
     from touchgoal.rewards.goals import Bank, OwnFrame, assign_goals, parse_goal
@@ -76,6 +81,7 @@ def main(config: Config) -> None:
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.run_folder import open_run
 
+    use_keys(config.keys)
     with_touch = config.towers is None or config.encoder is not None
     source = open_source(config.source, config.camera, config.index, with_touch, config.fps)
     if source.summary:

@@ -15,7 +15,7 @@ from touchgoal.sim_envs.config import BeadMazeConfig, TeleoperatorConfig
 
 if TYPE_CHECKING:
     from touchgoal.control.sensors.keyboard import Keyboard
-    from touchgoal.episodes.recording import EpisodeSpec
+    from touchgoal.episodes.recording import EpisodeSpec, check_fits
     from touchgoal.episodes.schema import Episode
     from touchgoal.sim_envs.bead_maze import BeadMaze
 
@@ -57,6 +57,7 @@ def main(config: Config) -> None:
     with Keyboard(sys.stdin) as keyboard:
         out = open_run(config.out, "teleop", config, adds=True)
         writer, metas = EpisodeWriter(out / "episodes", fps=config.env.control_hz), []
+        check_fits(writer, config.env)
         env = BeadMaze(config.env)
         try:
             for i, wire in enumerate(wires):

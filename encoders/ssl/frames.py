@@ -11,6 +11,7 @@ from torch import Tensor
 from touchgoal.control.features import TACTILE, TRUTH_PAD_WRENCH
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.episodes.faults import leave_out_faulty
 from touchgoal.episodes.importers.labelled_videos import LabelledVideo
 from touchgoal.episodes.importers.pretraining_clips import Recording as ClipRecording
 from touchgoal.episodes.store import EpisodeSet
@@ -69,8 +70,8 @@ def sample_frames(
     """Draw ticks at random from every episode, with every fingertip of each.
 
     The background is a fingertip's first frame: episodes start untouched. The first frame also
-    stands for frames before it, as it does when a policy acts. UserError: no touch in the set, or
-    another sensor's.
+    stands for frames before it, as it does when a policy acts. Faulty episodes are left out and
+    listed. UserError: no touch in the set, or another sensor's.
 
     Args:
         per_episode: Ticks drawn from each episode; all of a shorter one.
@@ -85,7 +86,8 @@ def sample_frames(
     preprocess = preprocessor_for(sensor)
     truth = [TRUTH_PAD_WRENCH] if TRUTH_PAD_WRENCH in episodes.features else []
     touch, wrench = [], []
-    for i in track(range(len(episodes)), "touches", "episode"):
+    sound = leave_out_faulty(episodes, range(len(episodes)), keys)
+    for i in track(sound, "touches", "episode"):
         check_sensor(episodes, i, sensor)
         ticks, rows, where = _draw_rows(episodes.lengths[i], per_episode, [seed, i], offsets)
         frames = episodes.read(i, keys, rows).frames

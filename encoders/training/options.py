@@ -22,6 +22,9 @@ class TrainerOptions:
     CPU without AVX-512 is 20 times slower with it."""
     resume: bool = False
     """Continue the run in --out after its last finished epoch."""
+    keys: Annotated[tuple[str, ...], RARE] = ()
+    """Keys of a LeRobot set whose features have other names: STORED=KEY, such as
+    observation.images.top=observation.images.front."""
 
 
 @checked_dataclass

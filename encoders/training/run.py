@@ -7,6 +7,7 @@ from typing import Any
 from touchgoal.encoders.training.checkpoint import check_run_folder
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
+from touchgoal.episodes.keys import use_keys
 from touchgoal.episodes.overlap import require_no_shared_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
@@ -15,11 +16,12 @@ from touchgoal.runtime.run_folder import open_run
 
 
 def check_training(options: TrainerOptions, out: Path | None, first: str = "") -> None:
-    """Check what can be checked before data are read; `first`: the first training's subfolder.
+    """Check what can be checked before data are read, and take the keys of the sets.
 
-    UserError: no such device, an unfit folder, or no folder where one is needed.
+    `first` is the first training's subfolder. UserError: no such device, keys of another form, an unfit folder, or no folder where one is needed.
     """
     check_device(options.device)
+    use_keys(options.keys)
     if out is None and options.resume:
         raise UserError("to resume a run, name its folder with --out")
     if out is None and int(os.environ.get("WORLD_SIZE", 1)) > 1:

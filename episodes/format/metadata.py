@@ -6,6 +6,7 @@ episode's `meta` (scalar or list of strings), `videos/KEY/crc32` for the checksu
 
 import io
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from touchgoal.control.features import ACTION
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import Description, index_columns
 from touchgoal.episodes.format.set_files import Row
@@ -96,6 +98,30 @@ class SetMetadata:
                 f"this set has other features than the episode ({', '.join(differing)} differ in "
                 "presence or shape): record it into another folder"
             )
+
+    def check_fits(self, root: Path, shapes: Mapping[str, tuple[int, ...]], task: str) -> None:
+        """Raise UserError if episodes to come would not fit the set in `root`.
+
+        `shapes` are of every observation and of the action, a frame; `task` is its name in meta.
+        """
+        there = {
+            key: tuple(feature["shape"])
+            for key, feature in self.features.items()
+            if key == ACTION or key.startswith("observation.")
+        }
+        for key in sorted({*there, *shapes}):
+            mine, theirs = (s.get(key, "absent") for s in (there, shapes))
+            if mine != theirs:
+                raise UserError(
+                    f"{key} is {mine} in {root} and {theirs} in the episodes to come: give the "
+                    "options that the set was recorded with, or record into another folder"
+                )
+        name = set_files.META_PREFIX + "task"
+        if self.episodes is not None and name in self.episodes.column_names:
+            if others := {*self.episodes[name].to_pylist()} - {task}:
+                raise UserError(
+                    f"{root} holds {min(others)}, not {task}: record into another folder"
+                )
 
     def _row(self, description: Description, file_number: int, stats: dict[str, Stats]) -> Row:
         before = set_files.last_row(self.episodes)

@@ -97,10 +97,13 @@ def _check(
             f"{episodes.root} runs at {episodes.fps} Hz, the policy at {config.control_hz}: set "
             "control_hz to the episodes' rate"
         )
-    if tuple(episodes.features[ft.STATE]["shape"]) != ft.FEATURES[ft.STATE].shape:
-        raise UserError(
-            f"{episodes.root} is of another arm: policies command an FR3's {ft.N_JOINTS} joints"
-        )
+    for key in (ft.STATE, ft.ACTION):
+        shape = episodes.features.get(key, {"shape": [0]})["shape"]
+        if tuple(shape) != ft.FEATURES[key].shape:
+            raise UserError(
+                f"{episodes.root} is of another arm: its {key} is {shape[0]} wide; policies read and "
+                f"command an FR3 ({key}: {ft.FEATURES[key].meaning})"
+            )
     if missing := set(config.proprioception) - set(episodes.features):
         raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy reads")
     if config.reads_wrench and ft.TRUTH_PAD_WRENCH not in episodes.features:

@@ -8,12 +8,14 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.episodes.faults import leave_out_faulty
 from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import TASKS, TaskName
 
+_READ = (ft.STATE, ft.COMMAND, ft.TCP_POSE, ft.WRENCH, ft.ACTION, *ft.TACTILE)
 _PAUSE = 0.5  # s
 _JOINT_MOTION = 2e-3  # rad since the first frame, or commanded since then
 _WIDTH_MOTION = 5e-4  # m of gripper width, measured or commanded
@@ -37,10 +39,11 @@ def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> Chos
     """Return the episodes that succeeded, and those in which an expert corrected a policy.
 
     `include_unknown` also takes those that do not say whether they succeeded, such as recordings of
-    an arm. UserError: none is left.
+    an arm. Faulty ones are left out and listed. UserError: none is left.
     """
     known = [succeeded(episodes.meta(i)) for i in range(len(episodes))]
     rows = [i for i, good in enumerate(known) if good or (good is None and include_unknown)]
+    rows = leave_out_faulty(episodes, rows, [key for key in _READ if key in episodes.features])
     unknown = 0 if include_unknown else known.count(None)
     chosen = ChosenEpisodes(rows, known.count(False), unknown)
     if not rows:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control.features import CAMERAS, TACTILE, TRUTH_CONTACT
-from touchgoal.episodes.schema import Episode, MetaValue, is_image
+from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT
+from touchgoal.episodes.faults import find_faults
+from touchgoal.episodes.schema import Episode, MetaValue, is_camera, is_image
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.rewards.distance.normalizer import scene_of
@@ -77,9 +78,9 @@ def open_episodes(root: Path, camera: str, index: Sequence[int], with_touch: boo
     _check_index(episodes, index)
     chosen = list(index or range(len(episodes)))
     touch = tuple(key for key in TACTILE if with_touch and key in episodes.features)
-    _check_camera(episodes, camera, bool(touch))
+    camera = _find_camera(episodes, camera, bool(touch))
     _check_sensors(episodes, chosen)
-    cameras = tuple(key for key in CAMERAS if key in episodes.features)
+    cameras = tuple(key for key in dict.fromkeys((*CAMERAS, camera)) if key in episodes.features)
     keys = [key for key in (*cameras, *touch, TRUTH_CONTACT) if key in episodes.features]
     tasks = {episodes.task(i) for i in chosen}
     if touch:
@@ -88,15 +89,17 @@ def open_episodes(root: Path, camera: str, index: Sequence[int], with_touch: boo
             check_fingertips(episodes, readable)
     offsets = [0, *accumulate(episodes.lengths)]
     found = [EpisodeTrajectory(episodes, i, offsets[i], tuple(keys)) for i in chosen]
-    short = [
-        Skipped(t.name, f"{t.source} has one frame: a curve needs at least 2")
+    faults = find_faults(episodes, chosen, keys)
+    faults |= {
+        t.index: f"{t.source} has one frame: a curve needs at least 2"
         for t in found
         if t.length < 2
-    ]
-    long = [t for t in found if t.length > 1]
-    if not long:
-        raise UserError(short[0].reason)
-    shortest = min(long, key=lambda t: t.length)
+    }
+    broken = [Skipped(t.name, faults[t.index]) for t in found if t.index in faults]
+    sound = [t for t in found if t.index not in faults]
+    if not sound:
+        raise UserError(broken[0].reason)
+    shortest = min(sound, key=lambda t: t.length)
     inputs = Inputs(
         name=shortest.source,
         camera=camera if camera in episodes.features else None,
@@ -107,7 +110,7 @@ def open_episodes(root: Path, camera: str, index: Sequence[int], with_touch: boo
         cameras=cameras,
         task=next(iter(tasks)) if len(tasks) == 1 else "",
     )
-    return Source(inputs, long, short)
+    return Source(inputs, sound, broken)
 
 
 def _check_index(episodes: EpisodeSet, index: Sequence[int]) -> None:
@@ -121,10 +124,15 @@ def _check_index(episodes: EpisodeSet, index: Sequence[int]) -> None:
         raise UserError(f"{root} has no episodes")
 
 
-def _check_camera(episodes: EpisodeSet, camera: str, touch: bool) -> None:
-    cameras = [key for key in CAMERAS if key in episodes.features]
-    if camera not in cameras and (cameras or not touch):
-        raise UserError(missing_camera(str(episodes.root), camera, cameras))
+def _find_camera(episodes: EpisodeSet, camera: str, touch: bool) -> str:
+    """Return the key of the camera; in place of the usual one a foreign set's only one."""
+    cameras = [key for key in episodes.features if is_camera(key)]
+    if camera in cameras or (touch and not cameras):
+        return camera
+    if episodes.foreign and camera == FRONT and len(cameras) == 1:
+        print(f"{episodes.root} has one camera: measuring {cameras[0]}")
+        return cameras[0]
+    raise UserError(missing_camera(str(episodes.root), camera, cameras))
 
 
 def _check_sensors(episodes: EpisodeSet, chosen: Sequence[int]) -> None:

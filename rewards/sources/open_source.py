@@ -1,5 +1,6 @@
 """Open the source of trajectories that a user names."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -36,13 +37,13 @@ def open_source(
     if not path.exists():
         raise UserError(f"{path} does not exist: give a set of episodes, a video or a folder")
     key = camera if camera.startswith(IMAGE_PREFIX) else f"{IMAGE_PREFIX}{camera}"
-    if key not in CAMERAS:
-        names = " or ".join(name.removeprefix(IMAGE_PREFIX) for name in CAMERAS)
-        raise UserError(f"there is no camera '{camera}': choose {names}")
     root = next((r for r in (path, path / "episodes") if (r / INFO).exists()), None)
     if root is None:
         if index:
             raise UserError(f"{path} is not a set of episodes: leave --index out")
+        if key not in CAMERAS:
+            names = " or ".join(name.removeprefix(IMAGE_PREFIX) for name in CAMERAS)
+            raise UserError(f"there is no camera '{camera}': choose {names}")
         return open_videos(path, key, with_touch, fps)
     if fps is not None:
         raise UserError(f"{path} states its own frame rate: leave --fps out")
@@ -64,9 +65,10 @@ def open_successes(
     sets = [s for s in sources if isinstance(s.trajectories[0], EpisodeTrajectory)]
     if not sources or len(sets) > 1 or (sets and len(sources) > 1):
         raise UserError("give one set of episodes, or several videos")
-    for source in sources:
-        if source.skipped:
-            raise UserError(f"{source.skipped[0].name} is broken: {source.skipped[0].reason}")
+    for skipped in (one for source in sources for one in source.skipped):
+        if not sets:
+            raise UserError(f"{skipped.name} is broken: {skipped.reason}")
+        print(f"left out: {skipped.reason}", file=sys.stderr)
     if not sets:
         if sum(len(source.trajectories) for source in sources) < 2:
             raise UserError("a normalizer needs at least two successful videos; give more of them")
