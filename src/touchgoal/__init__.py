@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from touchgoal.policies.checkpoint import load_policy as load_policy
     from touchgoal.policies.evaluation.evaluate import evaluate as evaluate
     from touchgoal.rewards.api import reward_curve as reward_curve
-    from touchgoal.sim_envs.tasks import make as make
+    from touchgoal.rewards.environments import make as make
+    from touchgoal.rewards.environments import make_vec as make_vec
 
 __version__ = "0.1.0"
 
@@ -48,7 +49,8 @@ _INTERFACE = {  # one call a job, imported at its first use: `import touchgoal` 
     "load_encoder": "touchgoal.encoders.pretrained",
     "load_policy": "touchgoal.policies.checkpoint",
     "load_episodes": "touchgoal.episodes.store",
-    "make": "touchgoal.sim_envs.tasks",
+    "make": "touchgoal.rewards.environments",
+    "make_vec": "touchgoal.rewards.environments",
     "reward_curve": "touchgoal.rewards.api",
 }
 

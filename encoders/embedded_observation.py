@@ -1,0 +1,68 @@
+"""Touch embeddings in place of tactile images in a Gymnasium environment's observations."""
+
+from collections import deque
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from touchgoal.control.features import TACTILE
+from touchgoal.encoders.backbones.frame_history import RecentFrames
+from touchgoal.encoders.pretrained import AnyTouchEncoder
+from touchgoal.runtime.errors import UserError
+
+TOUCH = "observation.touch"
+
+Observation = dict[str, np.ndarray]
+
+
+class EmbeddedTouch(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
+    """Replaces the tactile images by `observation.touch`: the left embedding, then the right one.
+
+    An episode's first images, which are untouched, are the background.
+    """
+
+    def __init__(self, env: gym.Env, encoder: AnyTouchEncoder) -> None:
+        """Wrap an environment with both fingertips; UserError if it has none."""
+        super().__init__(env)
+        assert isinstance(env.observation_space, gym.spaces.Dict)
+        spaces = dict(env.observation_space.items())
+        if missing := [key for key in TACTILE if key not in spaces]:
+            raise UserError(f"the environment has no {missing[0]} to embed: leave tactile on")
+        self._encoder = encoder.eval()
+        self._recent = {k: RecentFrames(encoder.preprocess, encoder.offsets) for k in TACTILE}
+        self._ticks: deque[Observation] = deque(maxlen=1 + max(encoder.offsets))
+        self._untouched: Observation = {}
+        width = len(TACTILE) * encoder.config.embedding_dim
+        kept = {key: space for key, space in spaces.items() if key not in TACTILE}
+        touch = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
+        self.observation_space = gym.spaces.Dict(kept | {TOUCH: touch})
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; its first images must be free of contact."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._untouched = {key: observation[key] for key in TACTILE}
+        self._ticks.clear()
+        return self._embedded(observation), info
+
+    def step(self, action: np.ndarray) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
+        """Run one step."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._embedded(observation), reward, terminated, truncated, info
+
+    def _embedded(self, observation: Observation) -> Observation:
+        self._ticks.append(observation)
+        kept = {key: value for key, value in observation.items() if key not in TACTILE}
+        return kept | {TOUCH: self._embed()}
+
+    @torch.no_grad()
+    def _embed(self) -> Float32[np.ndarray, " e"]:
+        frames = [
+            self._recent[key].latest([tick[key] for tick in self._ticks], self._untouched[key])
+            for key in TACTILE
+        ]
+        return self._encoder.embed_touch(self._encoder.stack(torch.cat(frames))).numpy().ravel()

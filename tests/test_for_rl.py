@@ -1,0 +1,57 @@
+"""Environments for reinforcement learning: Stable-Baselines3 trains on them as they are."""
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.env_checker import check_env
+
+import touchgoal
+from touchgoal.control import features as ft
+from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.for_rl import TACTILE_SIZE
+
+SHORT = {"max_seconds": 0.5, "objects": ("glass_ball",)}
+
+
+def test_keys_actions_and_touch() -> None:
+    env = touchgoal.make("pick-place", for_rl=True, cameras=(), **SHORT)
+    check_env(env)
+    observation, _ = env.reset(seed=0)
+    assert set(observation) == {
+        "state", "command", "tcp_pose", "wrench", "tactile_left", "tactile_right"
+    }  # fmt: skip
+    assert observation["tactile_left"].shape == (*TACTILE_SIZE, 3)
+    plain = touchgoal.make("pick-place", cameras=(), **SHORT)
+    plain.reset(seed=0)
+    speed, stroke = plain.action_space.high[:7], plain.action_space.high[7]
+    action = np.append(np.full(7, 0.5), -1.0).astype(np.float32)
+    for _ in range(3):
+        observation, *_, info = env.step(action)
+        expected, *_ = plain.step(np.append(0.5 * speed, 0.0).astype(np.float32))
+    np.testing.assert_allclose(observation["state"], expected[ft.STATE], atol=1e-6)
+    assert stroke > 0 and info["is_success"] is False
+    with pytest.raises(UserError, match="need for_rl=True"):
+        touchgoal.make("pick-place", touch="embedding")  # type: ignore[call-overload]
+    with pytest.raises(UserError, match="needs a goal"):
+        touchgoal.make("pick-place", for_rl=True, reward="touch")
+
+
+@pytest.mark.slow
+def test_ppo_and_sac_train_as_they_are() -> None:
+    env = touchgoal.make("pick-place", for_rl=True, touch="embedding", cameras=(), **SHORT)
+    assert env.observation_space["touch"].shape == (2 * 256,)
+    SAC("MultiInputPolicy", env, learning_starts=16, buffer_size=100).learn(32)
+    blind = touchgoal.make("pick-place", for_rl=True, tactile=False, cameras=(), **SHORT)
+    model = PPO("MultiInputPolicy", blind, n_steps=256, n_epochs=1).learn(1000)
+    assert model.num_timesteps >= 1000
+
+
+def test_several_at_once_with_touch() -> None:
+    envs = touchgoal.make_vec("pick-place", 2, cameras=(), **SHORT)
+    try:
+        observation, _ = envs.reset(seed=[3, 4])
+        assert observation["tactile_left"].shape == (2, *TACTILE_SIZE, 3)
+        assert not np.array_equal(*observation["state"])
+        envs.step(envs.action_space.sample())
+    finally:
+        envs.close()
