@@ -15,7 +15,7 @@ from touchgoal.runtime.errors import UserError
 
 TOUCH = "observation.touch"
 
-Observation = dict[str, np.ndarray]
+Observation = dict[str, Any]
 
 
 class EmbeddedTouch(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):

@@ -12,7 +12,7 @@ from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 TACTILE_SIZE = (60, 80)
 """Rows and columns of tactile images for RL: a quarter of the sensor's, to fit a replay buffer."""
 
-Observation = dict[str, np.ndarray]
+Observation = dict[str, Any]
 _OBSERVATION = "observation."
 
 

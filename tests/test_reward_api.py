@@ -177,7 +177,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["0.mp4", "--normalizer", "none.json"], "there is no normalizer at none.json"),
         (["one.mp4"], "has one frame: a curve needs at least 2"),
         (["episodes", "--camera", "wrist"], "choose --camera observation.images.front"),
-        (["episodes", "--camera", "top"], "there is no camera 'top'"),
+        (["episodes", "--camera", "top"], "has no images of observation.images.top: choose"),
         (["episodes", "--index", "7"], "has no episode 7; it has 0 to 2"),
         (["episodes", "--goal", "frame:99"], "whose frames are 0 to 11"),
         (["episodes", "--encoder", "nobody"], "there is no touch encoder 'nobody'"),
