@@ -270,7 +270,7 @@ def _add_words(config: Words) -> None:
     from touchgoal.encoders.alignment.wand_set import WandSet
     from touchgoal.encoders.alignment.words import add_words
     from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
-    from touchgoal.encoders.pretrained import load_encoder, save
+    from touchgoal.encoders.pretrained import ENCODER_FORMAT, find_encoder, load_encoder, save
     from touchgoal.encoders.towers.towers import load_towers
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.provenance import provenance
@@ -300,7 +300,8 @@ def _add_words(config: Words) -> None:
         "heads": asdict(config.heads),
         "seed": config.seed,
     }
-    save(worded, out / "encoder", {"words_added_to": config.encoder, **source, **provenance()})
+    before = ENCODER_FORMAT.provenance(find_encoder(config.encoder, published=False))
+    save(worded, out / "encoder", {"words_added_to": before, **source, **provenance()})
     print(f"encoder: {out / 'encoder'}")
 
 

@@ -137,7 +137,7 @@ def test_objectfolder_real(tmp_path: Path) -> None:
     result = zero_shot.run(zero_shot.Config(data=tmp_path))
     assert "the most frequent material" in result["table"] and "0.67" in result["table"]
     with pytest.raises(UserError, match="has no words"):
-        zero_shot.run(zero_shot.Config(data=tmp_path, encoders=("gelsight_mini_surfaces",)))
+        zero_shot.run(zero_shot.Config(data=tmp_path, encoders=("gelsight_mini_markers_mae",)))
 
 
 def test_tvl(tmp_path: Path) -> None:

@@ -25,7 +25,9 @@ from touchgoal.control.features import (
     TRUTH_START,
 )
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS
+from touchgoal.encoders.pretrained import save
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
@@ -345,12 +347,14 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_p
 def test_a_cell_chooses_the_encoder_of_its_rewards(tmp_path: Path) -> None:
     text = (EXAMPLES / "sim.toml").read_text()
     cell = tmp_path / "cell.toml"
-    words = 'rewards = ["text:a hard ball"]\nencoder = "gelsight_mini_surfaces"'
+    plain = PooledEncoder(PooledEncoderConfig.for_sensor("gelsight_mini"))
+    save(plain, tmp_path / "plain", {})
+    words = f'rewards = ["text:a hard ball"]\nencoder = "{tmp_path / "plain"}"'
     cell.write_text(text.replace("[task]", f"[task]\n{words}"))
     with pytest.raises(UserError, match="was not aligned with texts"):
         load_cell_cost(read_cell_file(cell))
     cell.write_text(
-        text.replace("[task]", f"[task]\n{words}".replace("gelsight_mini_surfaces", "x"))
+        text.replace("[task]", f"[task]\n{words}".replace(str(tmp_path / "plain"), "x"))
     )
     with pytest.raises(UserError, match="there is no touch encoder 'x'"):
         load_cell_cost(read_cell_file(cell))
