@@ -9,7 +9,7 @@ CODE := runtime control sim_envs episodes encoders rewards policies benchmarks l
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test interop lint check format build docs typings weights weights-markers maze-policy pick-place-policy clean
+.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy pick-place-policy clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -30,6 +30,13 @@ interop: $(READY)
 	.venv-interop/bin/pip install -q numpy pylibfranka franky-control ur_rtde franky-sim==1.0.4 "mujoco<3.3" trimesh
 	.venv-interop/bin/pip install -q --no-deps franka-sim==1.1.7
 	$(BIN)/python tests/interop/run.py
+
+# Sets both ways between touchgoal and lerobot, which runs in an environment of its own, under its own pins.
+PYTHON312 ?= python3.12
+interop-lerobot: $(READY)
+	$(PYTHON312) -m venv .venv-lerobot
+	.venv-lerobot/bin/pip install -q "lerobot[dataset,diffusion]==0.6.1"
+	$(BIN)/python tests/interop/lerobot_run.py .venv-lerobot/bin/python
 
 # Format, lint and types.
 lint: $(READY) typings

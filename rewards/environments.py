@@ -69,7 +69,7 @@ def make(
             `for_rl`.
         reward: gain in the task's progress, or the fall of the cost to a goal.
         goal: goal of reward "touch", outside the episode: "goal:FILE", "bank:SET", "episode:SET#K".
-        normalizer: normalizer.json of reward "touch"; default: raw distances.
+        normalizer: normalizer.json of reward "touch"; default: the touch encoder's own.
         encoder: touch encoder of embeddings and of reward "touch"; default: the one that ships for the
             sensor.
         render_mode: "rgb_array" for wrappers that record videos.
@@ -120,9 +120,7 @@ def _with_touch_reward(
     from touchgoal.rewards.reward_model import load_reward_model
     from touchgoal.rewards.reward_wrapper import TouchReward, inputs_of
 
-    model = load_reward_model(
-        inputs_of(env), [parse_goal(goal)], encoder, normalizer=normalizer or "none"
-    )
+    model = load_reward_model(inputs_of(env), [parse_goal(goal)], encoder, normalizer=normalizer)
     return TouchReward(env, model)
 
 

@@ -14,6 +14,7 @@ from touchgoal.episodes.faults import find_faults, leave_out_faulty
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
 
 TOP = "observation.images.top"
@@ -104,3 +105,42 @@ def test_a_video_that_is_too_short_or_of_another_rate(foreign: Path) -> None:
         episodes.read(2, [TOP])
     write_video(path, toy_frames(0, 75)[TOP], 30)
     assert "30 frames per second" in find_faults(EpisodeSet(foreign), [0], [TOP])[0]
+
+
+HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], np.float32)
+
+
+def arm_frames(seed: int, n: int = 40) -> Frames:
+    """An FR3 near its home, as lerobot would record it with touchgoal's keys, seen by a camera `top`."""
+    rng = np.random.default_rng(seed)
+    joints = HOME + 0.01 * np.cumsum(rng.normal(size=(n, 7)), 0)
+    state = np.concatenate([joints, np.zeros((n, 7)), np.full((n, 1), 0.04)], 1)
+    pose = np.concatenate([rng.normal(size=(n, 3)), np.tile([1.0, 0, 0, 0], (n, 1))], 1)
+    numbers = {
+        ft.STATE: state,
+        ft.TCP_POSE: pose,
+        ft.ACTION: np.concatenate([np.diff(joints, axis=0, append=joints[-1:]), state[:, -1:]], 1),
+        "timestamp": np.arange(n) / 15 + rng.uniform(-0.01, 0.01, n),
+    }
+    numbers = {key: values.astype(np.float32) for key, values in numbers.items()}
+    return {TOP: toy_frames(seed, n)[TOP], **numbers}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process")
+def test_commands_take_jitter_and_leave_faults_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train = [arm_frames(i) for i in range(3)]
+    train[1]["timestamp"][20:] += 0.5
+    write_lerobot_set(tmp_path / "train", train)
+    write_lerobot_set(tmp_path / "validation", [arm_frames(9), arm_frames(10)])
+    main(["reward-curves", str(tmp_path / "train"), "--out", str(tmp_path / "curves")])
+    assert "1 of 3 skipped" in (said := capsys.readouterr().out) and "one camera" in said
+    assert "frame 20 has the time stamp" in (tmp_path / "curves/skipped.csv").read_text()
+    options = "--include-unknown --task pick-place --trials 0 --train.epochs 1".split()
+    data = ["--data", str(tmp_path / "train"), "--validation", str(tmp_path / "validation")]
+    main(["train-policy", *data, *options, "--out", str(tmp_path / "policy")])
+    said = capsys.readouterr()
+    assert "2 episodes for training, 2 episodes for validation" in said.out
+    assert "episode 1 of" in said.err and "frame 20 has the time stamp" in said.err
