@@ -143,13 +143,15 @@ def _done(root: Path) -> dict[int, bool]:
 def _recorded(
     folder: Path, scene: Scene, wanted: Sequence[Wanted], env: PickPlaceConfig
 ) -> Iterable[Recorded]:
+    """Return the episodes that came out as asked, no more than wanted of each."""
+    left = {w.first_seed: w.count for w in wanted}
     for name, _, _ in _groups(env):
         root = folder / f"{scene}-{name}"
-        if not (root / INFO).exists():
-            continue
-        episodes = EpisodeSet(root)
-        for i in range(len(episodes)):
+        episodes = EpisodeSet(root) if (root / INFO).exists() else None
+        for i in range(len(episodes) if episodes else 0):
             meta = episodes.meta(i)
             for w in wanted:
-                if meta["seed"] in w.seeds and meta["outcome"] == w.outcome:
+                mine = meta["seed"] in w.seeds and meta["outcome"] == w.outcome
+                if mine and left[w.first_seed]:
+                    left[w.first_seed] -= 1
                     yield Recorded(root, i, w.purpose, w.outcome, str(meta["asked"]), scene)
