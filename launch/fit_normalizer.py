@@ -57,7 +57,7 @@ def main(config: Config) -> None:
     from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
     from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
-    from touchgoal.rewards.fit_value import fit_value
+    from touchgoal.rewards.fit_value import LEAST_EPISODES, fit_value
     from touchgoal.rewards.reward_model import load_embedder
     from touchgoal.rewards.sources.open_source import open_successes
     from touchgoal.rewards.success import SUCCESS, check_demonstrations, fit_success, last_costs
@@ -74,9 +74,10 @@ def main(config: Config) -> None:
     trajectories = [t for source in sources for t in source.trajectories]
     if config.success_from:
         check_demonstrations(config.success_from)
-        if config.success_from > len(trajectories) - 2:
+        least = LEAST_EPISODES if config.value else 2
+        if len(trajectories) - config.success_from < least:
             raise UserError(
-                f"--success-from is {config.success_from}, which leaves fewer than two of "
+                f"--success-from {config.success_from} leaves fewer than {least} of "
                 f"{len(trajectories)} successes to fit on"
             )
     out = open_run(config.out, "fit-normalizer", config)
