@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from touchgoal.rewards.report.record import Facts
+from touchgoal.rewards.report.success_table import SUCCESSES, success_table
 from touchgoal.rewards.success import SUCCESS, fit_success, load_success_threshold
 from touchgoal.runtime.errors import UserError
 
@@ -39,3 +41,24 @@ def test_stored_beside_the_normalizer(tmp_path: Path) -> None:
     (tmp_path / SUCCESS).write_text("[]")
     with pytest.raises(UserError, match="no success threshold"):
         load_success_threshold(normalizer)
+
+
+def facts(name: str, last: float, outcome: str, own_goal: bool = False) -> Facts:
+    return Facts(
+        name=name, source=name, index=0, offset=0, frames=9, fps=20.0, unit="", normalised=True,
+        goal={}, own_goal=own_goal, contact=None, contact_source="no touch", object="",
+        outcome=outcome, success=outcome == "success" if outcome else None,
+        measured={"fused": {"end": last}}, peaks={}, shown=[], columns=[],
+    )  # fmt: skip
+
+
+def test_the_table_says_what_is_accepted_and_what_is_unknown(tmp_path: Path) -> None:
+    threshold = fit_success(np.linspace(0.1, 0.9, 9).tolist())
+    measured = [facts("a", 0.2, "success"), facts("b", 0.95, "success"), facts("c", 0.3, "off")]
+    table = success_table(measured, threshold, tmp_path)
+    assert "success: 1 of 2 accepted" in table and "off: 1 of 1 accepted" in table
+    assert "unknown" not in table
+    lines = (tmp_path / SUCCESSES).read_text().splitlines()
+    assert lines == ["name,last_cost,success", "a,0.2000,yes", "b,0.9500,no", "c,0.3000,yes"]
+    table = success_table([facts("a", 0.2, "", own_goal=True)], threshold, tmp_path)
+    assert "how many failures pass is unknown" in table and "costs 0 whatever happened" in table
