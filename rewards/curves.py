@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 FUSED = {"image+tactile": ("image", "tactile"), "image+text": ("image", "text")}
 
+PLAIN = frozenset({"image", "tactile", "text", *FUSED})
+"""Plain distances of embeddings and their means, which stand beside the parts for comparison."""
+
 GAMMA = 1.0
 """Default discount a second of the potential-based reward: standing still pays nothing."""
 
@@ -134,6 +137,13 @@ def main_curve(names: Iterable[str]) -> str:
     listed = list(names)
     fused = [name for name in listed if name == "fused" or "+" in name]
     return (fused or listed)[0]
+
+
+def reference_levels(names: Iterable[str], normalised: bool) -> list[tuple[float, str]]:
+    """Return the costs that mean something, and what: for parts, for normalised distances, or none."""
+    if "fused" in names:
+        return [(0.0, "goal"), (1 / 3, "spread of successes"), (1.0, "far")]
+    return [(0.0, "usual end"), (1.0, "usual start")] if normalised else []
 
 
 def state_reward(cost: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from touchgoal.rewards.curves import main_curve
+from touchgoal.rewards.curves import PLAIN, main_curve, reference_levels
+from touchgoal.rewards.distance.parts import FUSED
 from touchgoal.rewards.report.record import Facts, Record
 from touchgoal.rewards.report.summary import COLUMNS
 from touchgoal.rewards.report.thumbnails import COLUMNS as SHEET_COLUMNS
@@ -108,7 +109,9 @@ def _content(facts: Sequence[Facts], episodes: Sequence[Mapping[str, Any]]) -> d
     return {
         "curves": names,
         "main": main_curve(names),
-        "normalised": facts[0].normalised,
+        # beside the parts, the plain distances are for comparison
+        "hidden": [name for name in names if name in PLAIN] if FUSED in names else [],
+        "levels": reference_levels(names, facts[0].normalised),
         "columns": [*used, {"key": "frames", "label": "frames", "digits": 0}, *metrics],
         "episodes": episodes,
     }

@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from touchgoal.episodes.film import BLACK, COLORS
-from touchgoal.rewards.curves import Curves, main_curve
+from touchgoal.rewards.curves import PLAIN, Curves, main_curve, reference_levels
+from touchgoal.rewards.distance.parts import FUSED
 
 _DASHES = ((0, (5, 2)), (0, (1.5, 1.5)), (0, (5, 1.5, 1.5, 1.5)), "-", (0, (3, 1)), (0, (8, 2)))
 _SINGLE = tuple(color for color in COLORS if color != BLACK)
@@ -20,18 +21,26 @@ _LABEL_GAP = 0.06  # least distance between two curve labels, share of the first
 def draw(curves: Curves, gamma: float) -> Figure:
     """Return a figure of costs, state rewards and potential-based rewards over time.
 
-    The first contact is marked, and on normalised costs the usual start and end of successes.
+    The first contact is marked, and the costs that mean something. With parts, the plain distances
+    are left out, and the rewards are those of the fused cost.
     """
+    costs = curves.costs
+    main = main_curve(costs)
+    drawn = [name for name in costs if name not in PLAIN] if main == FUSED else list(costs)
+    rewarded = [main] if main == FUSED else drawn
     panels = (
         (
             "distance to goal (cost, normalised)" if curves.normalised else f"cost: {curves.unit}",
-            curves.costs,
+            {name: costs[name] for name in drawn},
         ),
-        ("state reward\n= -cost", curves.rewards),
-        (f"potential-based\nreward, γ = {gamma:g}", curves.potential_rewards(gamma)),
+        ("state reward\n= -cost", {name: curves.rewards[name] for name in rewarded}),
+        (
+            f"potential-based reward\nγ = {gamma:g} a second",
+            {name: curves.potential_rewards(gamma)[name] for name in rewarded},
+        ),
     )
     fps, contact = curves.fps, curves.contact
-    styles = line_styles(list(curves.costs))
+    styles = line_styles(list(costs))
     figure = Figure(figsize=_SIZE, dpi=100)
     length = len(curves)
     for k, ((label, lines), (bottom, height)) in enumerate(zip(panels, _PANELS, strict=True)):
@@ -40,7 +49,7 @@ def draw(curves: Curves, gamma: float) -> Figure:
             axes.plot(np.arange(length) / fps, line, **styles[name])
         _frame_axes(axes, label, (length - 1) / fps)
         if k == 0:
-            _frame_costs(axes, bool(curves.normalised))
+            _frame_costs(axes, reference_levels(lines, bool(curves.normalised)))
         if contact.frame is not None:
             name = f"contact ({contact.label_source})" if k == 0 else ""
             _mark_contact(axes, contact.frame / fps, name)
@@ -85,18 +94,16 @@ def _frame_axes(axes: Axes, label: str, end: float) -> None:
     axes.spines[["left", "bottom"]].set_color("0.6")
 
 
-def _frame_costs(axes: Axes, normalised: bool) -> None:
-    """Start the cost axis at 0; if normalised, mark where successes usually start and end."""
-    high = axes.get_ylim()[1]
-    axes.set_ylim(min(-0.03 * high, axes.get_ylim()[0]), high)
-    if not normalised:
+def _frame_costs(axes: Axes, levels: Sequence[tuple[float, str]]) -> None:
+    """Start the cost axis at 0 at the latest, and mark the levels that mean something."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(-0.03 * high, low), high)
+    if not levels:
         return
-    axes.set_ylim(min(-0.04, axes.get_ylim()[0]), max(high, 1.2))
-    # Each name stands where a good curve is not: the start's at the end and the reverse.
-    for level, name, x, side in (
-        (1, "usual start", 0.995, "right"),
-        (0, "usual end, or nearer", 0.005, "left"),
-    ):
+    axes.set_ylim(min(-0.04, low), max(high, 1.2))
+    for level, name in levels:
+        # Each name stands where a good curve is not: the goal's at the start, the others' at the end.
+        x, side = (0.995, "right") if level else (0.005, "left")
         axes.axhline(level, color="0.6", linewidth=0.9, zorder=1)
         place = axes.get_yaxis_transform()
         axes.text(x, level, name, ha=side, va="bottom", color="0.5", transform=place)

@@ -103,7 +103,7 @@ def report_json(
         "cost": {"values": _rounded(curves.costs)},
         "state_reward": {"definition": "-cost", "values": _rounded(curves.rewards)},
         "potential_reward": {
-            "definition": "gamma * Phi(frame) - Phi(frame before), Phi = -cost; 0 at frame 0",
+            "definition": "g Phi(frame) - Phi(frame before), g = gamma^(1 / fps), Phi = -cost",
             "gamma": gamma,
             "values": _rounded(curves.potential_rewards(gamma)),
         },
@@ -120,7 +120,7 @@ def curves_csv(curves: Curves, gamma: float = GAMMA) -> str:
     """Return a CSV with a row a frame.
 
     Columns: frame, time (s); for every curve `cost_`, `reward_` (-cost) and `potential_reward_`
-    (gamma * Phi(frame) - Phi(frame before)); `cosine_distance_` of every single modality.
+    (see `report_json`); `cosine_distance_` of every single modality.
     """
     columns = columns_of(curves, gamma)
     text = io.StringIO()

@@ -1,8 +1,8 @@
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
-const COLORS = 9, MARGIN = { left: 46, right: 10, top: 12, bottom: 26 };
-const hidden = new Set();
+const COLORS = 10, MARGIN = { left: 46, right: 10, top: 12, bottom: 26 };
+const hidden = new Set(data.hidden);
 let chosen = null, frame = 0, order = data.episodes.slice(), sortedBy = null, descending = false;
 
 function make(tag, attributes, parent, text) {
@@ -68,7 +68,7 @@ function scales() {
   const box = byId("chart").getBoundingClientRect(), width = box.width || 800, height = box.height || 300;
   const shown = data.curves.filter((n) => chosen.curves[n] && !hidden.has(n));
   const values = shown.flatMap((n) => chosen.curves[n]);
-  let low = Math.min(0, ...values.slice(0, 1)), high = data.normalised ? 1.1 : 0.01;
+  let low = Math.min(0, ...values.slice(0, 1)), high = data.levels.length ? 1.1 : 0.01;
   for (const v of values) { low = Math.min(low, v); high = Math.max(high, v); }
   high += 0.04 * (high - low);
   const end = Math.max(chosen.frames - 1, 1);
@@ -99,11 +99,10 @@ function drawChart() {
   for (const t of steps(0, seconds, Math.min(8, s.width / 80))) {
     make("text", { x: s.x(t * chosen.fps), y: s.height - 8, "text-anchor": "middle" }, chart, `${t} s`);
   }
-  if (data.normalised) {
-    for (const [level, label, end] of [[1, "usual start", true], [0, "usual end", false]]) {
-      make("line", { class: "level", x1: MARGIN.left, x2: s.width - MARGIN.right, y1: s.y(level), y2: s.y(level) }, chart);
-      make("text", { x: end ? s.width - MARGIN.right - 4 : MARGIN.left + 5, y: s.y(level) - 5, "text-anchor": end ? "end" : "start" }, chart, label);
-    }
+  for (const [level, label] of data.levels) {
+    const atEnd = level > 0;
+    make("line", { class: "level", x1: MARGIN.left, x2: s.width - MARGIN.right, y1: s.y(level), y2: s.y(level) }, chart);
+    make("text", { x: atEnd ? s.width - MARGIN.right - 4 : MARGIN.left + 5, y: s.y(level) - 5, "text-anchor": atEnd ? "end" : "start" }, chart, label);
   }
   if (chosen.contact !== null) {
     const x = s.x(chosen.contact), right = chosen.contact > 0.85 * chosen.frames;
@@ -114,7 +113,7 @@ function drawChart() {
     const curve = chosen.curves[name], color = colorOf(name);
     const d = curve.map((v, k) => `${k ? "L" : "M"}${s.x(chosen.at[k]).toFixed(1)} ${s.y(v).toFixed(1)}`).join("");
     make("path", { d, class: name === data.main ? "main" : "", style: `stroke:${color}` }, chart);
-    for (const peak of chosen.peaks[name] || []) {
+    for (const peak of (name === byId("curve").value && chosen.peaks[name]) || []) {
       const x = s.x(peak), y = s.y(curve[nearest(chosen.at, peak)]) - 4;
       make("path", { d: `M${x} ${y}l-4.5 -7h9z`, class: "peak", style: `fill:${color};stroke:none` }, chart);
     }
@@ -219,7 +218,12 @@ function sortRows() {
 
 for (const name of data.curves) make("option", { value: name }, byId("curve"), name);
 byId("curve").value = data.main;
-byId("curve").onchange = () => { sortRows(); drawTable(); };
+byId("curve").onchange = () => {
+  hidden.delete(byId("curve").value);
+  sortRows();
+  drawTable();
+  if (chosen) { drawChart(); show(frame); }
+};
 for (const column of data.columns) {
   if (!column.meaning) continue;
   make("dt", {}, byId("meanings"), column.label);
