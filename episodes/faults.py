@@ -49,7 +49,7 @@ def find_faults(
 
 def _fault(episodes: EpisodeSet, i: int, keys: Sequence[str]) -> str | None:
     try:
-        if fault := _time_fault(episodes.time_stamps(i), episodes.fps):
+        if fault := _time_fault(episodes.stored_numbers(i, "timestamp")[:, 0], episodes.fps):
             return fault
         for key in keys:
             if episodes.features[key]["dtype"] == "video":
@@ -89,7 +89,7 @@ def _video_fault(episodes: EpisodeSet, i: int, key: str) -> str | None:
 
 
 def _number_fault(episodes: EpisodeSet, i: int, key: str) -> str | None:
-    values = episodes.read(i, [key]).frames[key].reshape(episodes.lengths[i], -1)
+    values = episodes.stored_numbers(i, key)
     if values.dtype.kind != "f" or np.isfinite(values).all():
         return None
     return f"{key} is not finite at frame {int(np.argwhere(~np.isfinite(values))[0][0])}"

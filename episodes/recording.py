@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
+import gymnasium as gym
 import numpy as np
 from jaxtyping import UInt8
 
@@ -240,6 +241,7 @@ def check_fits(writer: EpisodeWriter, config: TaskConfig) -> None:
     """Raise UserError if a task's episodes would not fit the set that the writer continues."""
     if len(writer):
         env = make_env(config)
+        assert isinstance(env.observation_space, gym.spaces.Dict)
         spaces = {**env.observation_space.spaces, ft.ACTION: env.action_space}
         shapes = {key: space.shape or () for key, space in spaces.items()}
         writer.check_fits(shapes, env.task)

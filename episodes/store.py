@@ -14,7 +14,7 @@ import os
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ import av.error
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float32, UInt8
+from jaxtyping import Shaped, UInt8
 
 from touchgoal.episodes.format import episode_table, set_files
 from touchgoal.episodes.format.encoding import EncodedEpisode, data_file, encode, read_columns
@@ -238,7 +238,7 @@ class EpisodeSet:
         """Return checksums of the frames of a feature of episode i, comparable in this process."""
         if self.features[key]["dtype"] != "image":
             return frozenset(hash(values.tobytes()) for values in self.read(i, [key]).frames[key])
-        images = self._stored_column(self._place(i), self._stored[key]).field("bytes")
+        images = self._stored_column(self._place(i), self._stored[key], keep=False).field("bytes")
         return frozenset(hash(image.as_py()) for image in images)
 
     def meta(self, i: int) -> dict[str, MetaValue]:
@@ -252,9 +252,15 @@ class EpisodeSet:
         """Return the instruction of episode i; "" if none is recorded."""
         return (self._place(i).facts["tasks"] or [""])[0]
 
-    def time_stamps(self, i: int) -> Float32[np.ndarray, " n"]:
-        """Return the time of every frame of episode i as stored, s from its start."""
-        return self._stored_column(self._place(i), "timestamp").to_numpy(zero_copy_only=False)
+    def stored_numbers(self, i: int, key: str) -> Shaped[np.ndarray, "n d"]:
+        """Return a feature of episode i, or `timestamp` (s from its start), as stored.
+
+        A column is read once for all episodes of a file.
+        """
+        column = self._stored_column(self._place(i), self._stored.get(key, key))
+        while not pa.types.is_primitive(column.type):
+            column = column.flatten()
+        return column.to_numpy(zero_copy_only=False).reshape(self.lengths[i], -1)
 
     def video_length(self, i: int, key: str) -> tuple[int, int, float]:
         """Return the frames that camera `key` has for episode i by its time stamps and by its file.
@@ -336,14 +342,12 @@ class EpisodeSet:
                 raise OSError(f"{rows} frames, too few for episode {i}")
             return read_columns(file, features, frames + place.first_row)
 
-    def _stored_column(self, place: EpisodePlace, name: str) -> pa.Array:
-        """Return a column of the data file, of the rows of one episode."""
-        with (
-            self._readable(place.data_file),
-            pq.ParquetFile(self.root / place.data_file, page_checksum_verification=True) as file,
-        ):
-            column = file.read([name])[name].slice(place.first_row, place.length)
-            return pa.concat_arrays(column.chunks)
+    def _stored_column(self, place: EpisodePlace, name: str, keep: bool = True) -> pa.Array:
+        """Return a column of one episode; small ones are kept for the file's other episodes."""
+        path, read = self.root / place.data_file, _read_column if keep else _read_column.__wrapped__
+        with self._readable(place.data_file):
+            column = read(path, path.stat().st_mtime_ns, name)
+            return pa.concat_arrays(column.slice(place.first_row, place.length).chunks)
 
     def _content_checksums(self, place: EpisodePlace) -> dict[str, Any]:
         """Return checksums of everything that is stored of an episode but its place in the set."""
@@ -356,6 +360,9 @@ class EpisodeSet:
                     found[stored] = video_checksum(
                         self.root / video.file, self.fps, video.first_frame, place.length
                     )
+            elif feature["dtype"] == "image":
+                images = self._stored_column(place, stored, keep=False).field("bytes")
+                found[stored] = [zlib.crc32(image.as_py()) for image in images]
             else:
                 values = self._stored_column(place, stored).to_pylist()
                 found[stored] = zlib.crc32(repr(values).encode())
@@ -370,6 +377,12 @@ class EpisodeSet:
             source = set_files.read_video(self.root, video.file, video.crc32)
         with self._readable(video.file):
             return decode_video(source, self.fps, (frames + video.first_frame).tolist())
+
+
+@lru_cache(maxsize=8)  # columns of a file whose episodes are gone through one by one
+def _read_column(path: Path, modified: int, name: str) -> pa.ChunkedArray:
+    with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        return file.read([name])[name]
 
 
 def load_episodes(

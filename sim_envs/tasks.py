@@ -22,18 +22,9 @@ def make(
     task: Literal["bead-maze"], *, render_mode: str | None = None, **options: Any
 ) -> BeadMaze: ...
 def make(task: str, *, render_mode: str | None = None, **options: Any) -> FrankaTactileEnv:
-    """Make the Gymnasium environment of a task.
+    """Make the Gymnasium environment of a task; see `rewards.environments.make`, which users call.
 
-    Args:
-        task: "pick-place" or "bead-maze".
-        render_mode: "rgb_array" for wrappers that record videos.
-        options: fields of the task's config by name, such as `cameras=("front",)`,
-            `camera_size=(96, 96)` or `tactile=False`: see `PickPlaceConfig` and `BeadMazeConfig`.
-            For a nested config, give a dict of the fields that change:
-            `randomization={"gain": 0.0}`.
-
-    Raises:
-        UserError: there is no such task or option, or a value is out of its range.
+    UserError: there is no such task or option, or a value is out of its range.
     """
     if task not in _ENVIRONMENTS:
         raise UserError(f"unknown task {task!r}; choose from: {', '.join(_ENVIRONMENTS)}")

@@ -153,6 +153,16 @@ def test_an_unfit_episode_leaves_the_set_as_it_was(small: Path, reason: str) -> 
     assert writer.append(make_episode(3)) == 3
 
 
+def test_episodes_to_come_are_checked_before_any_work(small: Path) -> None:
+    writer = EpisodeWriter(small, FPS)
+    shapes = {key: values.shape[1:] for key, values in make_episode(0).frames.items()}
+    shapes = {key: shape for key, shape in shapes.items() if not key.startswith("truth.")}
+    writer.check_fits(shapes, "pick-place")
+    for key, shape in ((ft.WRIST, (64, 64, 3)), (ft.FRONT, (32, 48, 3)), (ft.STATE, (13,))):
+        with pytest.raises(UserError, match=f"{key} is .* in .* the episodes to come"):
+            writer.check_fits(shapes | {key: shape}, "pick-place")
+
+
 def test_refusals_say_what_to_do(small: Path, tmp_path: Path) -> None:
     episodes = EpisodeSet(small)
     with pytest.raises(UserError, match="episodes 0 to 2, not 3"):

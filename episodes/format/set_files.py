@@ -97,6 +97,8 @@ def load_info(root: Path) -> dict[str, Any]:
         isinstance(f, dict) and isinstance(f.get("dtype"), str) and isinstance(f.get("shape"), list)
         for f in features.values()
     )
+    if isinstance(fps := info.get("fps"), float) and fps.is_integer():
+        info["fps"] = int(fps)
     wrong = [] if sound else ["features"]
     for key, least in _COUNTS.items():
         if type(value := info.get(key)) is not int or value < least:
