@@ -9,7 +9,7 @@ CODE := runtime control sim_envs episodes encoders rewards policies benchmarks l
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy pick-place-policy clean
+.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers weights-surfaces maze-policy pick-place-policy clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -90,6 +90,13 @@ weights-markers: $(READY)
 	$(BIN)/touchgoal train-encoder align --data runs/markers/train/episodes \
 		--validation runs/markers/val/episodes --normalizer-episodes 60 --out runs/markers/run
 	cp runs/markers/run/encoder/* encoders/weights/gelsight_mini_markers_offline/
+
+# The encoder that tells real things apart, with words and pictures of the wand's objects.
+weights-surfaces: $(READY)
+	$(BIN)/touchgoal collect-touches --out runs/wand
+	$(BIN)/touchgoal train-encoder surfaces --out runs/surfaces
+	$(BIN)/touchgoal train-encoder words --data runs/wand/episodes --encoder runs/surfaces/encoder --out runs/words
+	cp runs/words/encoder/* encoders/weights/gelsight_mini_surfaces/
 
 # How a shipped policy is made anew, by one command each that says what it did (recipe.json beside the
 # weights). The maze's learns its touch encoder first; with new pads pick-and-place needs `touchgoal
