@@ -48,9 +48,9 @@ class Config:
     normalizer: str | None = None
     """Normalizer of the distances: a normalizer.json of fit-normalizer; encoder, the one that comes
     with the encoder; or none. Default: the encoder's one for simulated pick-and-place, else none."""
-    gamma: Annotated[float, Field(gt=0, le=1)] = 0.99
-    """Discount factor of the potential-based reward gamma * Phi' - Phi, in (0, 1]. Set it to the
-    discount factor of the RL algorithm that uses the reward."""
+    gamma: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Discount a second of the potential-based reward gamma * Phi' - Phi, in (0, 1]; with 1 standing
+    still pays nothing. For an RL algorithm that discounts by g a frame it is g to the power of fps."""
     plots: CountOrNone = 100
     """Number of trajectories, from the first, that get a plot of their own."""
     audit: CountOrNone = 0

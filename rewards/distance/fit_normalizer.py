@@ -1,10 +1,12 @@
 """Fitting of a `DistanceNormalizer` on successful episodes, of any camera and any lab."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
+from touchgoal.episodes.schema import Episode
 from touchgoal.rewards.distance.embedding_distance import (
     text_distances,
     touch_distances,
@@ -59,6 +61,26 @@ def fit_normalizer(
     return DistanceNormalizer(
         start, goal, units, separated, made_with, scene, len(episodes), command
     )
+
+
+def start_and_end(chunks: Iterable[Episode]) -> Iterator[Episode]:
+    """Yield the frames of a trajectory that a normalizer is fitted on: its first 5 and last 6."""
+    start, end = None, None
+    for chunk in chunks:
+        start = start or _rows(chunk, slice(START_FRAMES))
+        both = chunk if end is None else _joined(end, chunk)
+        end = _rows(both, slice(-1 - END_FRAMES, None))
+    if start is not None and end is not None:
+        yield _joined(start, end)
+
+
+def _rows(episode: Episode, rows: slice) -> Episode:
+    return replace(episode, frames={key: v[rows] for key, v in episode.frames.items()})
+
+
+def _joined(one: Episode, other: Episode) -> Episode:
+    frames = {key: np.concatenate([v, other.frames[key]]) for key, v in one.frames.items()}
+    return replace(one, frames=frames)
 
 
 def fit_units(episodes: Sequence[EmbeddedEpisode]) -> dict[str, float]:
