@@ -126,6 +126,7 @@ def _deploy(
     from touchgoal.control import features as ft
     from touchgoal.control.cell.limits import cell_watchdogs
     from touchgoal.control.deployment.actors import make_actor
+    from touchgoal.control.deployment.control_loop import Request
     from touchgoal.control.deployment.preflight import preflight
     from touchgoal.control.deployment.session import Session
     from touchgoal.control.deployment.terminal import HELP, Terminal
@@ -138,6 +139,9 @@ def _deploy(
 
     def record(frames: dict[str, np.ndarray], task: str, meta: dict[str, Any]) -> int:
         return writer().append(Episode(frames, task, meta))
+
+    def request() -> Request:
+        return terminal.operator_request() or ("failed" if cost and cost.failed else "")
 
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     print("checks before anything moves:", flush=True)
@@ -154,7 +158,7 @@ def _deploy(
         record=record,
         execute=config.execute,
         make_actor=lambda loop: make_actor(cell, policy, safety, connection.truth, loop.commanded),
-        operator_request=terminal.operator_request,
+        operator_request=request,
         on_tick=terminal.show_tick,
         cost=cost.latest_cost if cost else None,
         camera_size=policy.camera_size if policy else ft.CAMERA_SHAPE[:2],

@@ -49,7 +49,7 @@ def reward_curve(
         curves = reward_curve(images, {"left": left, "right": right}, goal=("last", "a hard ball"))
         curves.costs["tactile"]  # (T,): distance to the goal
         curves.rewards["image"]  # (T,): -cost
-        curves.potential_rewards(gamma=0.99)["text"]  # (T,): gamma * Phi' - Phi with Phi = -cost
+        curves.potential_rewards()["text"]  # (T,): Phi' - Phi with Phi = -cost
         curves.plot().savefig("curves.png")
 
     Args:

@@ -20,6 +20,7 @@ from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.normalizer import REAL_SCENE
 from touchgoal.rewards.distance.parts import FUSED
+from touchgoal.rewards.failure_watch import FailureWatch
 from touchgoal.rewards.features.embedded import EmbeddedGoal
 from touchgoal.rewards.features.feature_stream import FeatureStream
 from touchgoal.rewards.goals import Inputs, parse_goal
@@ -93,9 +94,11 @@ def _stacked(ticks: Sequence[Observation]) -> dict[str, np.ndarray]:
 class OnlineCost:
     """Measures the newest tick in a thread, whenever the one before is done."""
 
-    def __init__(self, meter: CostMeter) -> None:
-        """Start the thread; `close` ends it."""
+    def __init__(self, meter: CostMeter, give_up: float = 0.0) -> None:
+        """Start the thread; `close` ends it. `give_up`: rise of the cost that is a failure; 0: none."""
         self._meter = meter
+        self._watch = FailureWatch(give_up or float("inf"), CONTROL_HZ)
+        self.failed = False  # whether the cost has risen by `give_up` and stayed there for a second
         self._first: tuple[Observation, ...] = ()  # ticks without contact
         self._newest: tuple[Observation, tuple[Observation, ...]] | None = None
         self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)
@@ -110,7 +113,9 @@ class OnlineCost:
         if len(self._first) < START_FRAMES:
             self._first = (*self._first, observation)
         self._newest = observation, self._first
-        return self._latest.read()
+        cost = self._latest.read()
+        self.failed = self.failed or self._watch.update(cost)
+        return cost
 
     def close(self) -> None:
         """End the thread."""
@@ -146,4 +151,5 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
     model = load_reward_model(
         inputs, goals, task.encoder or None, normalizer=task.normalizer or None
     )
-    return OnlineCost(CostMeter(model, task.objects[0] if len(task.objects) == 1 else ""))
+    meter = CostMeter(model, task.objects[0] if len(task.objects) == 1 else "")
+    return OnlineCost(meter, task.give_up)

@@ -328,19 +328,20 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_p
     noise = np.random.default_rng(1).integers(0, 30, (5, *TOUCH["left"].shape[1:]), dtype=np.uint8)
     left = np.concatenate([TOUCH["left"][:5] + noise, TOUCH["left"][5:]])
     embedder = EpisodeEmbedder(PaintTowers(), encoder)
-    ends = {"image": 1.0, "text": 1.0}, {"image": 0.1, "text": 0.2}, {}
+    ends = {"image": 1.0, "text": 1.0}, {"image": 0.1, "text": 0.2}, {"front": 0.02}
     normalizer = DistanceNormalizer(*ends, {}, embedder.made_with, "recorded, not simulated", 3)
     goals = [GoalPicture(tmp_path / "end.png"), Sentence("soft")]
     frames = {FRONT: IMAGES, TACTILE_LEFT: left, TACTILE_RIGHT: TOUCH["right"]}
     recording = embedder.embed_episode(Episode(frames=frames, task="", meta={}), 20.0, "recording")
     goal = embedder.embed_goal(assign_goals(goals, recording.modalities), recording)
-    expected = compute_curves(recording, goal, normalizer).costs["image+text"]
+    expected = compute_curves(recording, goal, normalizer).parts["fused"]
+    assert np.ptp(expected) > 0.05
     meter, ticks = (
         CostMeter(model_of(encoder, normalizer, *goals)),
         [{key: values[i] for key, values in frames.items()} for i in range(len(IMAGES))],
     )
     during = [meter.measure(tick, ticks[: min(i + 1, 5)]) for i, tick in enumerate(ticks)]
-    np.testing.assert_allclose(during[4:], expected[4:], atol=1e-5)
+    np.testing.assert_allclose(during[4:], expected[4:], atol=1e-6)
     assert np.abs(during[0] - expected[0]) > 1e-4  # one frame is another background
 
 

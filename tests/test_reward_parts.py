@@ -22,6 +22,7 @@ from touchgoal.rewards.distance.parts import (
     smooth,
     soft_minimum,
 )
+from touchgoal.rewards.failure_watch import FailureWatch
 from touchgoal.rewards.features.contact_reading import ContactReader, ContactReadings
 from touchgoal.rewards.features.embedded import (
     CameraFeatures,
@@ -271,3 +272,9 @@ def test_the_cost_rewards_an_environment() -> None:
     assert reward == -info["cost"] < 0 and info["task_reward"] == 7.0
     with pytest.raises(UserError, match="not known before the end"):
         TouchReward(env, replace(model, goal=Goal(image=OwnFrame())))
+
+
+def test_a_run_whose_cost_has_risen_for_a_second_has_failed() -> None:
+    watch = FailureWatch(0.3, ticks=3)
+    falling, bump, lost = [0.9, 0.6, 0.4], [0.8, 0.8, 0.4], [0.75, 0.75, 0.75]
+    assert [watch.update(c) for c in (*falling, *bump, *lost)] == [*[False] * 8, True]

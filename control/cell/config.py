@@ -142,6 +142,9 @@ class TaskSection:
     normalizer: str = ""
     """Normaliser of that distance: a normalizer.json that fit-normalizer made from successes in this cell.
     Default: the encoder's own on a simulated arm or a twin, the raw distance elsewhere."""
+    give_up: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Rise of that distance above its lowest in the run which, kept for a second, ends the run as failed; 0:
+    never."""
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -80,13 +80,15 @@ class Ending:
         return f"STOPPED: {self.reason}\n  the arm: {rest}\n  what to do: {self.advice}"
 
 
-Request = Literal["", "stop", "done", "not done", "success"]
-"""Operator's request: go on, stop the arm, end with the task done or not; success: a simulator's."""
+Request = Literal["", "stop", "done", "not done", "success", "failed"]
+"""Operator's request: go on, stop the arm, end with the task done or not; success: a simulator's;
+failed: the cost's."""
 PLAN_ENDED = "the plan is through"
 _REQUESTED_ENDINGS: dict[Request, Ending] = {
     "done": Ending("the operator says that the task is done", done=True),
     "not done": Ending("the operator says that the task is not done", done=False),
     "success": Ending("the simulator says that the task is done", done=True),
+    "failed": Ending("the cost has risen for a second: the policy has failed", done=False),
 }
 
 
