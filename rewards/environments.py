@@ -117,8 +117,8 @@ def _with_touch_reward(
     env: gym.Env, goal: str, normalizer: str | Path | None, encoder: str | Path | None
 ) -> gym.Env:
     from touchgoal.rewards.goals import parse_goal
+    from touchgoal.rewards.online.reward_wrapper import TouchReward, inputs_of
     from touchgoal.rewards.reward_model import load_reward_model
-    from touchgoal.rewards.reward_wrapper import TouchReward, inputs_of
 
     model = load_reward_model(inputs_of(env), [parse_goal(goal)], encoder, normalizer=normalizer)
     return TouchReward(env, model)

@@ -15,8 +15,8 @@ from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNo
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
 from touchgoal.rewards.goals import Goal, GoalSpec, Inputs, assign_goals, check_goal
-from touchgoal.rewards.value import REMEDY as VALUE_REMEDY
-from touchgoal.rewards.value import VALUE_FORMAT, Value
+from touchgoal.rewards.value.value import REMEDY as VALUE_REMEDY
+from touchgoal.rewards.value.value import VALUE_FORMAT, Value
 from touchgoal.runtime.errors import UserError
 
 _FIT = "touchgoal fit-normalizer, on successful episodes of your own"

@@ -21,7 +21,7 @@ from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.distance.parts import FUSED
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, goal_at_every_frame
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
-from touchgoal.rewards.value import Value
+from touchgoal.rewards.value.value import Value
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 

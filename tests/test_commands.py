@@ -291,7 +291,7 @@ def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
 def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording, "HELD_OUT_OBJECTS", ("brick", "toy_brick"))
     monkeypatch.setattr(recording, "TRAINING_OBJECTS", ("candle", "soda_can"))
-    monkeypatch.setattr("touchgoal.rewards.fit_value._STEPS", 5)
+    monkeypatch.setattr("touchgoal.rewards.value.fit_value._STEPS", 5)
     sizes = "--episodes 1 --suboptimal 1 --successes 2 --training 4 --goals 1 --calibration 9"
     run(
         *f"benchmark reward-quality {sizes} --scenes fixed --every 2 --env.control-hz 5 --env.camera-size 64 64".split(),

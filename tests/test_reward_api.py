@@ -37,7 +37,7 @@ from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import GoalPicture, GoalSpec, Inputs, OwnFrame, Sentence, assign_goals
-from touchgoal.rewards.online import CostMeter, OnlineCost, load_cell_cost
+from touchgoal.rewards.online.cost_meter import CostMeter, OnlineCost, load_cell_cost
 from touchgoal.rewards.reward_model import RewardModel, load_reward_model
 from touchgoal.rewards.sources.open_source import open_source
 from touchgoal.runtime.errors import UserError

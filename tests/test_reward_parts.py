@@ -22,7 +22,6 @@ from touchgoal.rewards.distance.parts import (
     smooth,
     soft_minimum,
 )
-from touchgoal.rewards.failure_watch import FailureWatch
 from touchgoal.rewards.features.contact_reading import ContactReader, ContactReadings
 from touchgoal.rewards.features.embedded import (
     CameraFeatures,
@@ -30,11 +29,12 @@ from touchgoal.rewards.features.embedded import (
     goal_at_every_frame,
 )
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
-from touchgoal.rewards.fit_value import fit_value
 from touchgoal.rewards.goals import Goal, GoalPicture, OwnFrame
+from touchgoal.rewards.online.failure_watch import FailureWatch
+from touchgoal.rewards.online.reward_wrapper import TouchReward, inputs_of
 from touchgoal.rewards.reward_model import load_reward_model
-from touchgoal.rewards.reward_wrapper import TouchReward, inputs_of
-from touchgoal.rewards.value import Value
+from touchgoal.rewards.value.fit_value import fit_value
+from touchgoal.rewards.value.value import Value
 from touchgoal.runtime.errors import UserError
 
 N, GRASP = 40, 15

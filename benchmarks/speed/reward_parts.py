@@ -11,7 +11,7 @@ from touchgoal.control.features import CAMERA_SHAPE, CAMERAS, TACTILE_SHAPE
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.encoders.towers.towers import OfflineTowers
 from touchgoal.rewards.features.contact_reading import ContactReader
-from touchgoal.rewards.value import Value, ValueConfig
+from touchgoal.rewards.value.value import Value, ValueConfig
 
 
 @torch.inference_mode()

@@ -19,7 +19,7 @@ from touchgoal.rewards.distance.parts import (
     soft_minimum,
 )
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
-from touchgoal.rewards.value import Value
+from touchgoal.rewards.value.value import Value
 
 _ALPHA = 0.5  # share of the way to the line through baseline and sentence
 

@@ -12,9 +12,9 @@ from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal, goal_at_every_frame
-from touchgoal.rewards.fit_value import fit_value
 from touchgoal.rewards.goals import Goal, OwnFrame, Sentence
-from touchgoal.rewards.value import Value
+from touchgoal.rewards.value.fit_value import fit_value
+from touchgoal.rewards.value.value import Value
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 

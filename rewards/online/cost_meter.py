@@ -20,11 +20,11 @@ from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.normalizer import REAL_SCENE
 from touchgoal.rewards.distance.parts import FUSED
-from touchgoal.rewards.failure_watch import FailureWatch
 from touchgoal.rewards.features.embedded import EmbeddedGoal
 from touchgoal.rewards.features.feature_stream import FeatureStream
 from touchgoal.rewards.goals import Inputs, parse_goal
 from touchgoal.rewards.metrics import START_FRAMES
+from touchgoal.rewards.online.failure_watch import FailureWatch
 from touchgoal.rewards.reward_model import RewardModel, load_reward_model
 from touchgoal.runtime.errors import UserError
 

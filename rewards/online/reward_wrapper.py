@@ -9,7 +9,7 @@ from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE, Obse
 from touchgoal.rewards.curves import GAMMA
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.online import CostMeter
+from touchgoal.rewards.online.cost_meter import CostMeter
 from touchgoal.rewards.reward_model import RewardModel
 from touchgoal.runtime.errors import UserError
 

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float16
 from torch import Tensor
 
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
-from touchgoal.rewards.value import Value, ValueConfig
+from touchgoal.rewards.value.value import Value, ValueConfig
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
