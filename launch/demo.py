@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from touchgoal.control.features import ACTION, FRONT, IMAGE_PREFIX, TACTILE, TRUTH_CONTACT
+from touchgoal.control.features import ACTION, CAMERAS, FRONT, IMAGE_PREFIX, TACTILE, TRUTH_CONTACT
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
@@ -54,7 +54,9 @@ def main(config: Config) -> None:
     from touchgoal.sim_envs.pick_place import PickPlace
 
     sensor = find_sensor(config.env.sensor).name
-    inputs = Inputs("the demo's episode", FRONT, TACTILE, sensor, "simulated pick-place")
+    inputs = Inputs(
+        "the demo's episode", FRONT, TACTILE, sensor, "simulated pick-place", cameras=CAMERAS
+    )
     goals = [parse_goal("last"), parse_goal(f"text:{config.words}")]
     model = load_reward_model(inputs, goals)
     out = open_run(config.out, "demo", config)

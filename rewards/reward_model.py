@@ -73,7 +73,9 @@ def load_reward_model(
     if isinstance(normalizer, DistanceNormalizer):
         if reason := _mismatch(normalizer, inputs, goal, embedder):
             raise UserError(f"{name} does not apply here: {reason}; {REMEDY}")
-        value = _value_in(value_folder, inputs, embedder)
+        value, reason = _value_in(value_folder, inputs, embedder)
+        if reason:
+            raise UserError(f"{reason}; {VALUE_REMEDY}")
         note = f"normalizer: {name}" + ("" if value is None else ", with the value beside it")
         return RewardModel(embedder, goal, normalizer, note, value)
     if normalizer == "none":
@@ -87,19 +89,22 @@ def load_reward_model(
         return RewardModel(
             embedder, goal, None, f"raw cosine distances, for {reason}; to normalise them: {_FIT}"
         )
-    value = _value_in(folder, inputs, embedder)
-    note = f"normalizer: {reason}" + ("" if value is None else ", with the value beside it")
-    return RewardModel(embedder, goal, found, note, value)
+    value, why_not = _value_in(folder, inputs, embedder)
+    with_value = "" if value is None else ", with the value beside it"
+    without = f"; without the value, for {why_not}" if why_not else ""
+    return RewardModel(embedder, goal, found, f"normalizer: {reason}{with_value}{without}", value)
 
 
-def _value_in(folder: Path | None, inputs: Inputs, embedder: EpisodeEmbedder) -> Value | None:
-    """Return the value beside a normalizer, None without one; UserError if it does not hold here."""
+def _value_in(
+    folder: Path | None, inputs: Inputs, embedder: EpisodeEmbedder
+) -> tuple[Value | None, str]:
+    """Return the value beside a normalizer, and why it does not hold here; None without one."""
     if folder is None or not VALUE_FORMAT.weights_path(folder).is_file():
-        return None
+        return None, ""
     value = Value.load(folder)
     if reason := value.mismatch(inputs.fitted_task, inputs.cameras, embedder.made_with.towers):
-        raise UserError(f"the value in {folder} does not apply here: {reason}; {VALUE_REMEDY}")
-    return value
+        return None, f"the value in {folder} does not apply here: {reason}"
+    return value, ""
 
 
 def _normalizer_of_encoder(
