@@ -99,7 +99,9 @@ def fit_units(episodes: Sequence[EmbeddedEpisode]) -> dict[str, float]:
             between.setdefault(name, []).append(d[~np.eye(len(ends), dtype=bool)])
     pooled = {name: np.concatenate(d) for name, d in between.items()}
     return {
-        name: max(float(np.quantile(d, _UNIT_QUANTILE)), SMALLEST_UNIT[name])
+        name: max(
+            float(np.quantile(d, _UNIT_QUANTILE)), SMALLEST_UNIT.get(name, SMALLEST_UNIT["front"])
+        )
         for name, d in pooled.items()
         if len(d)
     }

@@ -29,7 +29,7 @@ PARTS = {
     "words": "touch against a sentence, normalised and clipped to [0, 1]",
     "value": "1 - the share of the way that a value sees, whatever the goal",
 }
-"""Meaning of each part."""
+"""Meaning of each part; another camera's is called after the camera."""
 
 TOUCH_PARTS = ("object", "force", "centre", "held")
 FUSED, VALUE, WORDS = "fused", "value", "words"
@@ -43,7 +43,8 @@ SMALLEST_UNIT = {
     "centre": 2e-4,  # m
     "held": 1 / 3,  # so that a missing fingertip costs 1
 }
-"""Least unit of each part, about the noise of a camera: some demonstrations end almost alike."""
+"""Least unit of each part, about the noise of a camera: some demonstrations end almost alike. Another
+camera has that of `front`."""
 _SATURATION = 3.0  # units beyond which a part does not count further
 _FORCE_FLOOR = 0.5  # N, below which the depth of a gel reads noise
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
