@@ -68,7 +68,7 @@ class Record:
 
     def save(self, path: Path) -> None:
         """Write the record atomically."""
-        arrays = {f"{_COLUMN}{key}": values for key, values in self.columns.items()}
+        arrays: dict[str, Any] = {f"{_COLUMN}{key}": v for key, v in self.columns.items()}
         arrays |= {f"{_SHEET}{key}": sheet for key, sheet in self.sheets.items()}
         facts = np.array(json.dumps(asdict(self.facts)))
         with atomic_write(path) as unfinished, unfinished.open("wb") as file:
