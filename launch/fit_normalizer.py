@@ -54,12 +54,13 @@ class Config:
 def main(config: Config) -> None:
     """Check, embed, fit, and write normalizer.json."""
     from touchgoal.episodes.keys import use_keys
+    from touchgoal.rewards.demonstration_costs import last_costs
     from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, start_and_end
     from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
     from touchgoal.rewards.reward_model import load_embedder
     from touchgoal.rewards.sources.open_source import open_successes
-    from touchgoal.rewards.success import SUCCESS, check_demonstrations, fit_success, last_costs
+    from touchgoal.rewards.success import SUCCESS, check_demonstrations, fit_success
     from touchgoal.rewards.value.fit_value import LEAST_EPISODES, fit_value
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.progress import track

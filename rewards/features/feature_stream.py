@@ -76,7 +76,7 @@ class FeatureStream:
         self._past[side] = known[len(known) - self._embedder.past_frames :]
         return self._embedder.embed_touch(known, self._backgrounds[side])[len(past) :]
 
-    def _read(self, frames: Mapping[str, UInt8[np.ndarray, "n h w 3"]]) -> ContactReadings:
+    def _read(self, frames: Frames) -> ContactReadings:
         return ContactReadings.stack(
             [reader.read(frames[side]) for side, reader in self._readers.items()]
         )
