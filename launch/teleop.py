@@ -15,7 +15,7 @@ from touchgoal.sim_envs.config import BeadMazeConfig, TeleoperatorConfig
 
 if TYPE_CHECKING:
     from touchgoal.control.sensors.keyboard import Keyboard
-    from touchgoal.episodes.recording import EpisodeSpec, check_fits
+    from touchgoal.episodes.recording import EpisodeSpec
     from touchgoal.episodes.schema import Episode
     from touchgoal.sim_envs.bead_maze import BeadMaze
 
@@ -43,7 +43,7 @@ class Config:
 def main(config: Config) -> None:
     """Offer the wires one by one, save the finished episodes, report them."""
     from touchgoal.control.sensors.keyboard import Keyboard
-    from touchgoal.episodes.recording import EpisodeSpec
+    from touchgoal.episodes.recording import EpisodeSpec, check_fits
     from touchgoal.episodes.store import EpisodeWriter
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.json_file import write_json
