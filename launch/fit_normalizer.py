@@ -30,6 +30,9 @@ class Config:
     success_from: CountOrNone = 0
     """Number of successes, the last ones, that fit nothing else and set the threshold of success
     (success.json): at least 9, for at most 10 % of successes rejected. 0: no threshold."""
+    made_failures: CountOrNone = 0
+    """Number of these successes of which seven kinds of failure are made each, from their pictures, to
+    see how many pass the threshold."""
     camera: str = "front"
     """Camera of the plain distance of images, such as front, wrist or a LeRobot set's top."""
     keys: Annotated[tuple[str, ...], RARE] = ()
@@ -54,7 +57,8 @@ class Config:
 def main(config: Config) -> None:
     """Check, embed, fit, and write normalizer.json."""
     from touchgoal.episodes.keys import use_keys
-    from touchgoal.rewards.demonstration_costs import last_costs
+    from touchgoal.episodes.schema import Episode, joined
+    from touchgoal.rewards.demonstration_costs import accepted_failures, last_costs
     from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, start_and_end
     from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
@@ -116,5 +120,15 @@ def main(config: Config) -> None:
         threshold = fit_success(last_costs(calibration, ends, normalizer, value))
         threshold.save(out / SUCCESS)
         print(threshold)
+        chosen = trajectories[len(trajectories) - config.success_from :][: config.made_failures]
+        successes = [joined(t.chunks()) for t in track(chosen, "reading", "trajectory")]
+
+        def last_cost(failure: Episode) -> float:
+            made = embedder.embed_episode(failure, chosen[0].fps, str(failure.meta["outcome"]))
+            return last_costs([made], ends, normalizer, value)[0]
+
+        for kind, passed in accepted_failures(threshold, successes, last_cost).items():
+            if successes:
+                print(f"  made failure {kind:<18}{passed} of {len(successes)} accepted")
     goal = f"--goal goal:{out / GOAL_FILE} --normalizer {out / NORMALIZER}"
     print(f"next: touchgoal reward-curves {config.sources[0]} {goal}")

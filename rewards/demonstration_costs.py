@@ -1,12 +1,15 @@
-"""Last costs of successful demonstrations, from which a success threshold is fitted."""
+"""Last costs of successful demonstrations, for a success threshold, and of failures made from them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from touchgoal.episodes.outcomes.generate import MADE, made_failures
+from touchgoal.episodes.schema import Episode
 from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.distance.parts import FUSED
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, goal_at_every_frame
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
+from touchgoal.rewards.success import SuccessThreshold
 from touchgoal.rewards.value.value import Value
 from touchgoal.runtime.errors import UserError
 
@@ -32,3 +35,25 @@ def last_costs(
             )
         costs.append(float(curves[FUSED][-1]))
     return costs
+
+
+def accepted_failures(
+    threshold: SuccessThreshold,
+    successes: Sequence[Episode],
+    last_cost: Callable[[Episode], float],
+) -> dict[str, int]:
+    """Return how many failures made from successes pass a threshold, by kind (`made_failures`).
+
+    The next success, with another object where there is one, lends its touch to the wrong object.
+    One whose pictures are refused (`UserError` of `last_cost`) does not pass.
+    """
+    passed = dict.fromkeys(MADE, 0)
+    for k, success in enumerate(successes):
+        later = [*successes[k + 1 :], *successes[:k]]
+        others = [e for e in later if e.meta.get("object") != success.meta.get("object")]
+        for kind, failure in made_failures(success, (others or later or [success])[0]).items():
+            try:
+                passed[kind] += threshold.accepts(last_cost(failure))
+            except UserError:
+                continue
+    return passed

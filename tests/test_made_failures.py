@@ -8,6 +8,8 @@ from touchgoal.control.features import FRONT, STATE, TACTILE
 from touchgoal.episodes.outcomes.generate import MADE, made_failures
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.touches import contact_per_frame
+from touchgoal.rewards.demonstration_costs import accepted_failures
+from touchgoal.rewards.success import SuccessThreshold
 from touchgoal.runtime.errors import UserError
 
 LENGTH, CONTACT = 30, 12
@@ -61,3 +63,16 @@ def test_a_success_that_never_touches_or_at_once_is_refused() -> None:
     blind = Episode({STATE: np.zeros((9, 15), np.float32)}, "place it")
     with pytest.raises(UserError, match="a camera and touch"):
         made_failures(blind, success(1))
+
+
+def test_a_threshold_is_tried_on_made_failures() -> None:
+    """By the gel's change at the end alone, what does not touch fails, and another object does not."""
+
+    def last_cost(failure: Episode) -> float:
+        side = failure.frames[TACTILE[0]].astype(float)
+        return float(np.abs(side[-1] - side[0]).max() < 20)
+
+    threshold = SuccessThreshold(0.5, "fused", 0.1, 9)
+    passed = accepted_failures(threshold, [success(0), success(1)], last_cost)
+    fails = dict.fromkeys(("never_touch", "freeze", "drop", "rewind"), 0)
+    assert passed == fails | dict.fromkeys(("over_press", "wrong_object", "swapped_colours"), 2)
