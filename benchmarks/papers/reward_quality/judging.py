@@ -1,7 +1,10 @@
 """Curves of embedded episodes to the ends of other successes with the same object."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
 
 from touchgoal.benchmarks.papers.reward_quality.embedding import EmbeddedFiles, load_embedder
 from touchgoal.benchmarks.papers.reward_quality.measures import Judged
@@ -29,17 +32,26 @@ class Judge:
     normalizer: DistanceNormalizer
     value: Value
     goals: dict[str, EmbeddedGoal]  # by object
+    sentences: dict[str, EmbeddedGoal]  # the same with a sentence for touch; empty without words
 
     def curves(self, episode: EmbeddedEpisode, goal: EmbeddedGoal) -> Curves:
         """Return the curves of an episode to a goal."""
         return compute_curves(episode, goal, self.normalizer, self.value)
+
+    def costs(self, episode: EmbeddedEpisode, name: str) -> dict[str, Float[np.ndarray, " n"]]:
+        """Return the costs to the goal of an object; a sentence has curves of its own."""
+        costs = self.curves(episode, self.goals[name]).costs
+        if name in self.sentences:
+            words = self.curves(episode, self.sentences[name]).costs
+            costs |= {curve: words[curve] for curve in ("text", "image+text")}
+        return costs
 
     def judge(self, recorded: Sequence[Recorded]) -> list[Judged]:
         """Measure episodes against the goals of the object that was asked for."""
         judged = []
         for r in track(recorded, "measuring", "episode"):
             episode = self.files.load(r)
-            costs = self.curves(episode, self.goals[r.object]).costs
+            costs = self.costs(episode, r.object)
             judged.append(Judged(r.outcome, r.object, len(episode) / episode.fps, costs))
         return judged
 
@@ -48,9 +60,7 @@ class Judge:
         episodes = [self.files.load(r) for r in recorded]
         return [
             {
-                r.object: {
-                    n: float(c[-1]) for n, c in self.curves(e, self.goals[r.object]).costs.items()
-                }
+                r.object: {n: float(c[-1]) for n, c in self.costs(e, r.object).items()}
                 for r in recorded
             }
             for e in episodes
@@ -79,17 +89,25 @@ def fit_judge(files: EmbeddedFiles, recorded: Sequence[Recorded]) -> Judge:
         if r.purpose == "goal":
             episode = files.load(r)
             ends.setdefault(r.object, []).append(episode.take(slice(len(episode) - 1, None)))
-    goals = {name: _bank(files.encoder, name, found) for name, found in ends.items()}
+    goals = {
+        name: goal_at_every_frame(found[0].extended(found[1:])) for name, found in ends.items()
+    }
     for r in recorded:
         if r.object not in goals and r.purpose == "test":
             raise UserError(f"no goal for {r.object}: its expert always failed; see {r.root}")
-    return Judge(files, normalizer, fit_value(training, _SCENE), goals)
+    return Judge(
+        files, normalizer, fit_value(training, _SCENE), goals, _sentences(files.encoder, goals)
+    )
 
 
-def _bank(encoder: str, name: str, ends: Sequence[EmbeddedEpisode]) -> EmbeddedGoal:
-    """Return the successful ends as one goal, with the object's sentence if touch knows words."""
-    goal = goal_at_every_frame(ends[0].extended(ends[1:]))
+def _sentences(encoder: str, goals: dict[str, EmbeddedGoal]) -> dict[str, EmbeddedGoal]:
+    """Return the goals of images with a sentence for touch; none if touch knows no words."""
     embedder = load_embedder(encoder)
     if not embedder.knows_words:
-        return goal
-    return replace(goal, text=embedder.embed_sentences([SENTENCES[name]]))
+        return {}
+    return {
+        name: EmbeddedGoal(
+            {}, frozenset(), image=goal.image, text=embedder.embed_sentences([SENTENCES[name]])
+        )
+        for name, goal in goals.items()
+    }

@@ -14,7 +14,12 @@ def sizes(judged: Mapping[str, Sequence[Judged]], training: int) -> str:
     """Return the number of episodes by outcome, and of those behind units and value."""
     counts = ", ".join(f"{outcome} {len(episodes)}" for outcome, episodes in judged.items())
     objects = len({e.object for episodes in judged.values() for e in episodes})
-    return f"episodes of {objects} held-out objects: {counts}; fitted on {training} successes"
+    one = next(iter(judged.values()))[0]
+    rate = len(next(iter(one.costs.values()))) / one.seconds
+    return (
+        f"episodes of {objects} held-out objects, {rate:g} frames a second: {counts}; fitted on "
+        f"{training} successes of other objects"
+    )
 
 
 def grid(title: str, rows: Grid) -> str:
