@@ -39,10 +39,14 @@ def maze(metrics: Metrics, **names: str) -> str:
     return "; ".join(found)
 
 
-def auc(metrics: Metrics) -> str:
-    """AUC of the final cost, success against a dropped object."""
-    drop = metrics["auc"]["drop"]
-    return f"{drop['image']:.2f} by image, {drop['image+tactile']:.2f} by image and touch"
+def reward_kinds(metrics: Metrics, scene: str) -> str:
+    """Mean AUC of the last cost over the kinds of failure: fused, and the plain distance."""
+
+    def figure(curve: str) -> str:
+        found = metrics["scenes"][scene]["auc"]["mean of true kinds"][curve]
+        return f"{found['value']:.2f} [{found['low']:.2f}, {found['high']:.2f}]"
+
+    return f"{figure('fused')} fused, {figure('image+tactile')} plain distance"
 
 
 def median_rate(metrics: Metrics, start: str, unit: str) -> str:
