@@ -23,7 +23,8 @@ class Config:
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """A set of episodes; or at least two video files or folders of images, each of one success."""
     modalities: tuple[Literal["image", "tactile", "text"], ...] = ()
-    """Modalities to fit. Default: all that the episodes have."""
+    """Modalities to fit: image and tactile by default, as far as the episodes have them; name text, too,
+    for goals that are sentences."""
     value: bool = False
     """Also fit a value of the task, from 4 successes on, in a minute or two. It holds for this task,
     these cameras and towers, and does not read the goal."""
@@ -75,7 +76,8 @@ def main(config: Config) -> None:
     with_touch = config.towers is None or config.encoder is not None
     sources = open_successes(config.sources, config.camera, with_touch, config.assume_success)
     inputs = sources[0].inputs
-    embedder, _ = load_embedder(inputs, config.encoder, config.towers, config.device)
+    words = "text" in config.modalities
+    embedder, _ = load_embedder(inputs, config.encoder, config.towers, config.device, words)
     trajectories = [t for source in sources for t in source.trajectories]
     if config.success_from:
         check_demonstrations(config.success_from)
@@ -95,10 +97,7 @@ def main(config: Config) -> None:
     ]
     calibration = embedded[len(embedded) - config.success_from :]
     embedded = embedded[: len(embedded) - config.success_from]
-    has_words = all(one.descriptions is not None for one in embedded)
-    modalities = config.modalities or tuple(
-        m for m in embedded[0].modalities if m != "text" or has_words
-    )
+    modalities = config.modalities or tuple(m for m in embedded[0].modalities if m != "text")
     normalizer = fit_normalizer(embedded, modalities, inputs.scene)
     value = fit_value(embedded, inputs.fitted_task, config.seed) if config.value else None
     ends = SuccessfulEnds.of(embedded)

@@ -14,7 +14,7 @@ from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNormalizer
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
-from touchgoal.rewards.goals import Goal, GoalSpec, Inputs, assign_goals, check_goal
+from touchgoal.rewards.goals import Goal, GoalSpec, Inputs, Sentence, assign_goals, check_goal
 from touchgoal.rewards.value.value import REMEDY as VALUE_REMEDY
 from touchgoal.rewards.value.value import VALUE_FORMAT, Value
 from touchgoal.runtime.errors import UserError
@@ -68,7 +68,8 @@ def load_reward_model(
     if isinstance(normalizer, str | Path) and str(normalizer) not in ("encoder", "none"):
         name, value_folder = normalizer, Path(normalizer).parent
         normalizer = DistanceNormalizer.load(Path(normalizer))
-    embedder, folder = load_embedder(inputs, encoder, towers, device, words=True)
+    words = any(isinstance(spec, Sentence) for spec in goals)
+    embedder, folder = load_embedder(inputs, encoder, towers, device, words)
     check_words(goals, embedder.encoder)
     if isinstance(normalizer, DistanceNormalizer):
         if reason := _mismatch(normalizer, inputs, goal, embedder):
@@ -134,7 +135,7 @@ def load_embedder(
     encoder: str | Path | AnyTouchEncoder | None = None,
     towers: str | Towers | None = None,
     device: str = "cpu",
-    words: bool = True,
+    words: bool = False,
 ) -> tuple[EpisodeEmbedder, Path | None]:
     """Load the encoders for trajectories; return them, and the folder that may have a normalizer.
 

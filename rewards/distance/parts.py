@@ -4,6 +4,15 @@ A part's cost is min(d / unit, 3) / 3, with its distance d to the goal and, as t
 of d among successful ends of the same object. 0 is the goal, 1/3 the spread of successes, 1 far
 away. A fingertip part costs its no-contact value until contact is detected, with hysteresis
 (`ContactReader`): before contact only the cameras can lower the fused cost.
+
+    front, wrist  pooled pictures of a camera, called after it
+    wrist_map     the wrist camera at stride 16: where things lie in the hand's frame
+    object        touch embedding: which object is held
+    force         grip force, from the depth of the gel
+    centre        where on the fingertips the object is held
+    held          whether the fingertips touch
+    words         touch against a sentence: the normalised distance, clipped to [0, 1]
+    value         1 - the share of the way that a value sees, whatever the goal
 """
 
 from collections.abc import Mapping
@@ -17,19 +26,6 @@ from touchgoal.rewards.features.contact_reading import ContactReadings
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
 
 Costs = dict[str, Float[np.ndarray, " n"]]
-
-PARTS = {
-    "front": "front camera, pooled: what the scene looks like",
-    "wrist": "wrist camera, pooled",
-    "wrist_map": "wrist camera at stride 16: where things lie in the hand's frame",
-    "object": "touch embedding: which object is held",
-    "force": "grip force, from the depth of the gel",
-    "centre": "where on the fingertips the object is held",
-    "held": "whether the fingertips touch",
-    "words": "touch against a sentence, normalised and clipped to [0, 1]",
-    "value": "1 - the share of the way that a value sees, whatever the goal",
-}
-"""Meaning of each part; another camera's is called after the camera."""
 
 TOUCH_PARTS = ("object", "force", "centre", "held")
 FUSED, VALUE, WORDS = "fused", "value", "words"
@@ -133,9 +129,9 @@ def part_costs(episode: EmbeddedEpisode, goal: EmbeddedGoal, units: Mapping[str,
     """Return the cost of each part that has a unit, in [0, 1]; fingertip parts gated by contact."""
     distances = part_distances(episode, goal)
     costs = {
-        name: np.minimum(soft_minimum(distances[name]) / units[name], _SATURATION) / _SATURATION
-        for name in PARTS
-        if name in distances and name in units
+        name: np.minimum(soft_minimum(d) / units[name], _SATURATION) / _SATURATION
+        for name, d in distances.items()
+        if name in units
     }
     if episode.readings is None or goal.readings is None:
         return costs
