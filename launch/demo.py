@@ -69,7 +69,8 @@ def main(config: Config) -> None:
     EpisodeWriter(out / "episodes", hz).append(held)
     curves = model.curves(model.embedder.embed_episode(held, hz, str(held.meta["object"])))
     write_report(curves, out, "curves", model.provenance())
-    write_film(out / "episode.mp4", pictures, episode, hz, curves.costs, "distance to goal")
+    shown = {k: c for k, c in curves.costs.items() if k == "fused" or k not in curves.parts}
+    write_film(out / "episode.mp4", pictures, episode, hz, shown, "distance to goal")
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
     write_json(out / "metrics.json", {k: m.as_dict() for k, m in curves.metrics().items()})
     print(metrics_table([curves]))

@@ -91,7 +91,9 @@ def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
     picture = cv2.imread(str(out / "episode_000.png"))
     assert picture is not None and picture.shape == (1000, 1200, 3)
     report = json.loads((out / "episode_000.json").read_text())
-    assert set(report["metrics"]) == {"image", "tactile", "text", "image+tactile", "image+text"}
+    plain = {"image", "tactile", "text", "image+tactile", "image+text"}
+    parts = {"front", "wrist", "wrist_map", "object", "force", "centre", "held", "words", "value"}
+    assert set(report["metrics"]) == {*plain, *parts, "fused"}
     rows = (out / "episode_000.csv").read_text().splitlines()
     assert len(rows) == 1 + EpisodeSet(episodes).lengths[0]
     assert report["metrics"]["tactile"]["end"] < 0.3 < 0.9 < report["metrics"]["tactile"]["start"]

@@ -4,6 +4,7 @@ All distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over t
 """
 
 from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -18,10 +19,18 @@ from touchgoal.rewards.distance.parts import (
     smooth_and_fuse,
     soft_minimum,
 )
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
-from touchgoal.rewards.value.value import Value
+from touchgoal.rewards.features.embedded import CameraFeatures, EmbeddedEpisode, EmbeddedGoal
 
 _ALPHA = 0.5  # share of the way to the line through baseline and sentence
+
+
+@runtime_checkable  # beartype checks arguments in tests
+class SeesProgress(Protocol):
+    """A `Value`, without the network library that it needs."""
+
+    def progress(self, cameras: Mapping[str, CameraFeatures]) -> Float[np.ndarray, " n"]:
+        """Return the share of the way at each frame, from that frame alone, in [0, 1]."""
+        ...
 
 
 def compute_distances(
@@ -42,7 +51,7 @@ def compute_curves(
     episode: EmbeddedEpisode,
     goal: EmbeddedGoal,
     normalizer: DistanceNormalizer | None,
-    value: Value | None = None,
+    value: SeesProgress | None = None,
     before: Mapping[str, float] | None = None,
 ) -> Curves:
     """Return the curves of one trajectory to one goal; without a normalizer raw, and none fused.
