@@ -126,8 +126,7 @@ def main(config: Config) -> None:
             made = embedder.embed_episode(failure, chosen[0].fps, str(failure.meta["outcome"]))
             return last_costs([made], ends, normalizer, value)[0]
 
-        for kind, passed in accepted_failures(threshold, successes, last_cost).items():
-            if successes:
-                print(f"  made failure {kind:<18}{passed} of {len(successes)} accepted")
+        for kind, (passed, made) in accepted_failures(threshold, successes, last_cost).items():
+            print(f"  made failure {kind:<18}{passed} of {made} accepted")
     goal = f"--goal goal:{out / GOAL_FILE} --normalizer {out / NORMALIZER}"
     print(f"next: touchgoal reward-curves {config.sources[0]} {goal}")

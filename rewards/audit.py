@@ -83,7 +83,7 @@ class AuditTable:
             return "touch use cannot be judged: the order of the cost is undefined"
         change = f"{row.replaced - row.real:+.2f} [{row.low:.2f}, {row.high:.2f}]"
         if not self.mattered:
-            return f"touch did not matter: shuffled in time, the cost's order changes by {change}"
+            return f"no sign that touch mattered: shuffled in time, the order changes by {change}"
         other = self._row("last cost", "another's")
         whose = "another episode's touch ends no differently"
         if other is not None and other.low > 0:
@@ -96,6 +96,9 @@ class AuditTable:
         head = f"{'metric':<11}{'touch':<11}{'real':>7}{'replaced':>10}   difference, 95 % interval"
         lines = [f"touch-use audit of {self.episodes} episodes", head]
         for r in self.rows:
+            if r.real != r.real:
+                lines.append(f"{r.metric:<11}{r.replacement:<11}{'-':>7}{'-':>10}   undefined")
+                continue
             interval = f"{r.replaced - r.real:+.2f} [{r.low:.2f}, {r.high:.2f}]"
             line = (
                 f"{r.metric:<11}{r.replacement:<11}{r.real:>7.2f}{r.replaced:>10.2f}   {interval}"

@@ -41,19 +41,21 @@ def accepted_failures(
     threshold: SuccessThreshold,
     successes: Sequence[Episode],
     last_cost: Callable[[Episode], float],
-) -> dict[str, int]:
-    """Return how many failures made from successes pass a threshold, by kind (`made_failures`).
+) -> dict[str, tuple[int, int]]:
+    """Return how many failures made from successes pass a threshold, of how many, by kind.
 
-    The next success, with another object where there is one, lends its touch to the wrong object.
-    One whose pictures are refused (`UserError` of `last_cost`) does not pass.
+    The next success with another object lends its touch to the wrong object; without one there is no
+    such failure. One whose pictures are refused (`UserError` of `last_cost`) does not pass.
     """
-    passed = dict.fromkeys(MADE, 0)
+    passed: dict[str, list[bool]] = {kind: [] for kind in MADE}
     for k, success in enumerate(successes):
         later = [*successes[k + 1 :], *successes[:k]]
         others = [e for e in later if e.meta.get("object") != success.meta.get("object")]
-        for kind, failure in made_failures(success, (others or later or [success])[0]).items():
-            try:
-                passed[kind] += threshold.accepts(last_cost(failure))
-            except UserError:
+        for kind, failure in made_failures(success, (others or [success])[0]).items():
+            if kind == "wrong_object" and not others:
                 continue
-    return passed
+            try:
+                passed[kind].append(threshold.accepts(last_cost(failure)))
+            except UserError:
+                passed[kind].append(False)
+    return {kind: (sum(accepted), len(accepted)) for kind, accepted in passed.items() if accepted}
