@@ -1,65 +1,23 @@
 """Train a touch encoder: on episodes, aligned or without labels; on simulated surfaces; on videos."""
 
-from dataclasses import asdict, field
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import tyro
 from pydantic import Field
 
-from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig, HeadsConfig
-from touchgoal.encoders.alignment.splits import Split
+from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.ssl import config as ssl
 from touchgoal.encoders.training.options import TrainerOptions
+from touchgoal.launch.support.align_options import Align, Preset, presets
 from touchgoal.runtime.option_types import (
     RARE,
     Count,
-    CountOrNone,
     Fraction,
     Seed,
     checked_dataclass,
 )
-
-Preset = Literal["default", "paper"]
-
-
-def _presets(option: str, presets: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    return {name: {option: config} for name, config in presets.items()}
-
-
-@checked_dataclass
-class Align(TrainerOptions):
-    """Align touch with frozen image and text networks by contrastive learning, as in MMWand."""
-
-    PRESETS: ClassVar = _presets("align", ALIGN_PRESETS)
-
-    data: Path = field(kw_only=True)
-    """Episodes or touches of the wand to train on, or the annotations.jsonl of `annotate`, with
-    --sensor."""
-    validation: Path | None = None
-    """Other episodes (or another annotations.jsonl), at least four of each object. Retrieval on one half
-    of them chooses the best epoch; the other half is the test set. Of touches of the wand a fifth is
-    held out instead."""
-    split: Annotated[Split, RARE] = "press"
-    """Units held out of touches of the wand: single touches, visits, objects or sentences."""
-    out: Path | None = None
-    """Folder of the run; the encoder goes to its `encoder/`."""
-    preset: Preset = "default"
-    """Default hyperparameters: for two CPU cores, or the MMWand paper's (ViT-H, 100 epochs, temperature
-    0.2, lambda 1). --align.* overrides them."""
-    sensor: str | None = None
-    """Fingertip sensor of episodes that do not name theirs."""
-    towers: str = "offline"
-    """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local folder."""
-    contact_frames: Count = 24
-    """Frames with contact taken from each episode."""
-    no_contact_frames: CountOrNone = 8
-    """Frames without contact taken from each episode."""
-    normalizer_episodes: Count = 40
-    """Successful training episodes on which the normalizer is fitted (encoder/normalizer.json): it
-    scales distances in reward curves to 1 at the usual start of an episode and 0 at its goal."""
-    align: AlignConfig = ALIGN_PRESETS["default"]
-    """Hyperparameters."""
 
 
 @checked_dataclass
@@ -95,7 +53,7 @@ class _Unlabelled(TrainerOptions, _UnlabelledData):
 class Mae(_Unlabelled):
     """Train without labels by masked autoencoding (MAE)."""
 
-    PRESETS: ClassVar = _presets("mae", ssl.MAE_PRESETS)
+    PRESETS: ClassVar = presets("mae", ssl.MAE_PRESETS)
 
     frames: Count = 40
     stride: Count = 2
@@ -108,7 +66,7 @@ class Mae(_Unlabelled):
 class Dino(_Unlabelled):
     """Train without labels by self-distillation of two frames (DINO)."""
 
-    PRESETS: ClassVar = _presets("dino", ssl.DINO_PRESETS)
+    PRESETS: ClassVar = presets("dino", ssl.DINO_PRESETS)
 
     dino: ssl.DinoConfig = ssl.DINO_PRESETS["default"]
     """Hyperparameters."""
@@ -118,7 +76,7 @@ class Dino(_Unlabelled):
 class IJepa(_Unlabelled):
     """Train without labels by predicting hidden blocks of two frames (I-JEPA)."""
 
-    PRESETS: ClassVar = _presets("ijepa", ssl.IJEPA_PRESETS)
+    PRESETS: ClassVar = presets("ijepa", ssl.IJEPA_PRESETS)
 
     ijepa: ssl.IJepaConfig = ssl.IJEPA_PRESETS["default"]
     """Hyperparameters."""
@@ -128,7 +86,7 @@ class IJepa(_Unlabelled):
 class VJepa(_Unlabelled):
     """Train without labels by predicting hidden tubes of four-frame clips (V-JEPA)."""
 
-    PRESETS: ClassVar = _presets("vjepa", ssl.VJEPA_PRESETS)
+    PRESETS: ClassVar = presets("vjepa", ssl.VJEPA_PRESETS)
 
     frames: Count = 10
     stride: Count = 1

@@ -14,6 +14,9 @@ from touchgoal.runtime.option_types import (
     checked_dataclass,
 )
 
+Split = Literal["sample", "press", "object", "sentence"]
+"""What is held out of touches of the wand, see `splits`."""
+
 
 @checked_dataclass
 class Augmentation:

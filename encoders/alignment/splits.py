@@ -6,12 +6,12 @@ sentences are on both sides, so a nearest neighbour in raw pixels scores high (R
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Int
 
-Split = Literal["sample", "press", "object", "sentence"]
+from touchgoal.encoders.alignment.config import Split
+
 SPLITS: tuple[Split, ...] = ("sample", "press", "object", "sentence")
 TEST_SHARE = 1048 / 5182
 """The paper's share of test touches."""

@@ -24,7 +24,8 @@ class EfficientNetBackbone(nn.Module):
         """
         super().__init__()
         network = load_efficientnet_lite0()
-        self.stem, self.blocks, self.scale = network.stem, network.blocks[: LAST_BLOCK + 1], scale
+        self.stem, self.scale = network.stem, scale
+        self.blocks = nn.ModuleList(list(network.blocks)[: LAST_BLOCK + 1])
         for frozen in (self.stem, *self.blocks[:_FROZEN]):
             frozen.requires_grad_(False)
 

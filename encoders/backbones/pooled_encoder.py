@@ -4,6 +4,7 @@ The direction of an embedding describes the surface, wherever and however it is 
 0 to 1, the strength of the contact at the strongest spot of the image.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -145,7 +146,7 @@ class PooledEncoder(BaseTouchEncoder):
     def pool(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
         """Return means and standard deviations over the image, stage by stage."""
         network = self._network[0].to(touch.device)
-        blocks = network.blocks[: self.config.last_block + 1]
+        blocks = list(network.blocks)[: self.config.last_block + 1]
         return pool_stages(network.stem, blocks, draw(touch, self._scale))
 
 
@@ -160,7 +161,7 @@ def draw(touch: Float[Tensor, "n 3 h w"], scale: float) -> Float[Tensor, "n 3 h 
 
 
 def pool_stages(
-    stem: nn.Module, blocks: nn.Sequential, images: Float[Tensor, "n 3 h w"]
+    stem: nn.Module, blocks: Iterable[nn.Module], images: Float[Tensor, "n 3 h w"]
 ) -> Float[Tensor, "n d"]:
     """Return means and standard deviations of RGB images (0 to 1) after the `STAGES` within `blocks`."""
     x = stem(imagenet_normalised(images).contiguous(memory_format=torch.channels_last))

@@ -1,7 +1,6 @@
 """The three kinds of data that `train-encoder align` takes, and what it does with each."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from touchgoal.encoders.alignment.align import align
 from touchgoal.encoders.alignment.splits import split_touches
@@ -12,6 +11,7 @@ from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.run import check_training, open_sets, open_training, recipe
 from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.touches import collect_touches
+from touchgoal.launch.support.align_options import Align
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
 from touchgoal.rewards.distance.normalizer import NORMALIZER, scene_of
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
@@ -19,11 +19,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 from touchgoal.runtime.provenance import provenance
 
-if TYPE_CHECKING:
-    from touchgoal.launch.train_encoder import Align
 
-
-def align_touch(config: "Align") -> None:
+def align_touch(config: Align) -> None:
     """Check episodes, touches of the wand or annotations, and align a touch encoder on them."""
     check_training(config, config.out)
     if config.data.suffix != ".jsonl" and is_wand_set(config.data):
@@ -61,7 +58,7 @@ def align_touch(config: "Align") -> None:
     print(f"encoder and normalizer: {out / 'encoder'}")
 
 
-def _align_wand(config: "Align") -> None:
+def _align_wand(config: Align) -> None:
     """Align on touches of the wand; there are no successful episodes to fit a normalizer on."""
 
     if config.validation is not None:
@@ -77,7 +74,7 @@ def _align_wand(config: "Align") -> None:
     print(f"encoder: {out / 'encoder'}")
 
 
-def _align_annotated(config: "Align", validation: Path) -> None:
+def _align_annotated(config: Align, validation: Path) -> None:
     """Align on the annotations of `annotate`; without successful episodes no normalizer is fitted."""
 
     train, val = open_annotations(config.data, validation, config.sensor)

@@ -22,11 +22,11 @@ from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_s
 from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_retrieval
 from touchgoal.benchmarks.papers.mmwand.trained import embed_fold, read_touch_data, train
-from touchgoal.encoders.alignment.config import AlignConfig, HeadsConfig
+from touchgoal.encoders.alignment.config import AlignConfig, HeadsConfig, Split
 from touchgoal.encoders.alignment.data import TouchData
 from touchgoal.encoders.alignment.heads import Paired, fit_heads
 from touchgoal.encoders.alignment.retrieval import average_precisions
-from touchgoal.encoders.alignment.splits import SPLITS, Fold, Split, split_touches
+from touchgoal.encoders.alignment.splits import SPLITS, Fold, split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60

@@ -142,7 +142,7 @@ def _pooled(
         drawn = (128 + _CONTRAST * torch.from_numpy(batch).permute(0, 3, 1, 2)).clamp(0, 255) / 255
         with torch.no_grad():
             rows.append(
-                pool_stages(network.stem, network.blocks[: STAGES[-1][0] + 1], drawn).numpy()
+                pool_stages(network.stem, list(network.blocks)[: STAGES[-1][0] + 1], drawn).numpy()
             )
     return np.concatenate(rows)
 
