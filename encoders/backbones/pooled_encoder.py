@@ -31,7 +31,7 @@ _CONTRAST = 4.0  # counts of the network's input per count of change
 # 10 % more or less light, and 9.2 at the 5 % quantile of touches.
 _CELLS = 12, 16
 # Counts at which an embedding has half of its length: about three times the noise of a real sensor, 2.6.
-# With 4, real grasps seemed to begin eight frames before 0.5 N on the load cell (`benchmark real-force`).
+# Costs of real grasps then fall within 3 frames of 0.5 N on the load cell in most (`benchmark real-force`).
 _HALF_LENGTH = 8.0
 
 
