@@ -251,16 +251,16 @@ def _row(
     rng = np.random.default_rng(0)
     if metric == "AUC":
         good, bad = np.flatnonzero(~failed), np.flatnonzero(failed)
-        pairs = [_auc(m["last cost"], good, bad) for m in (real, replaced)]
+        before, after = (_auc(m["last cost"], good, bad) for m in (real, replaced))
         drawn = [(rng.choice(good, len(good)), rng.choice(bad, len(bad))) for _ in range(_DRAWS)]
         changes = [
             _auc(replaced["last cost"], *rows) - _auc(real["last cost"], *rows) for rows in drawn
         ]
-        return AuditRow(metric, replacement, *pairs, *_limits(np.array(changes)))
+        return AuditRow(metric, replacement, before, after, *_limits(np.array(changes)))
     both = np.isfinite(real[metric]) & np.isfinite(replaced[metric]) & ~failed
     before, after = real[metric][both], replaced[metric][both]
     if len(before) < 2:
-        return AuditRow(metric, replacement, *[float("nan")] * 4)
+        return AuditRow(metric, replacement, np.nan, np.nan, np.nan, np.nan)
     rows = rng.integers(len(before), size=(_DRAWS, len(before)))
     limits = _limits((after - before)[rows].mean(axis=1))
     return AuditRow(metric, replacement, float(before.mean()), float(after.mean()), *limits)

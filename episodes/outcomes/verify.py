@@ -32,7 +32,7 @@ class Truth:
     @property
     def held(self) -> bool:
         """Whether both pads press on something at the end."""
-        return bool((self.grip[-1] > 0.1).all())
+        return bool(np.all(self.grip[-1] > 0.1))
 
     @property
     def carried(self) -> bool:
@@ -42,7 +42,7 @@ class Truth:
     @property
     def grasps(self) -> int:
         """Number of separate times that both pads held something."""
-        gripped = (self.grip > 0.1).all(axis=1)
+        gripped = np.asarray((self.grip > 0.1).all(axis=1))
         return int(gripped[0]) + int((np.diff(gripped.astype(int)) == 1).sum())
 
     @property
@@ -60,7 +60,7 @@ def read_truth(frames: Mapping[str, np.ndarray]) -> Truth:
     tcp = frames[ft.TCP_POSE]
     offset = np.einsum("nij,ni->nj", _rotations(tcp[:, 3:]), place - tcp[:, :3])
     return Truth(
-        touched=frames[ft.TRUTH_CONTACT].any(axis=1),
+        touched=np.asarray(frames[ft.TRUTH_CONTACT].any(axis=1)),
         height=place[:, 2] - start[:, 2],
         away=np.linalg.norm(place[:, :2] - start[:, 5:7], axis=1),
         in_hand=offset,

@@ -31,6 +31,7 @@ from touchgoal.benchmarks.papers.reward_quality.recording import (
     SUBOPTIMAL,
     Recorded,
     Scene,
+    Sizes,
     plan,
     record,
 )
@@ -49,23 +50,11 @@ _AUDITED = ("success", "drop", "wrong_object")
 
 
 @checked_dataclass
-class Config(BenchmarkOptions):
+class Config(BenchmarkOptions, Sizes):
     """Options of benchmark reward-quality."""
 
     encoder: str = "gelsight_mini"
     """Touch encoder, by name or folder; the simulated sensor is the encoder's."""
-    episodes: Count = 30
-    """Judged episodes of each kind of failure."""
-    suboptimal: Count = 30
-    """Judged episodes of either poor success."""
-    successes: Count = 100
-    """Judged successes."""
-    training: Count = 60
-    """Successes of the training objects that fit units and value."""
-    goals: Count = 3
-    """Successes of each judged object whose ends are its goals."""
-    calibration: Count = 30
-    """Successes of the judged objects that set the success threshold."""
     every: Count = 1
     """Measure every n-th frame only: n times faster, with times that are n times coarser."""
     scenes: tuple[Scene, ...] = SCENES

@@ -3,13 +3,14 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 from touchgoal.benchmarks.papers.reward_objects import HELD_OUT_OBJECTS, TRAINING_OBJECTS
 from touchgoal.episodes.format.set_files import INFO
 from touchgoal.episodes.recording import EpisodeSpec, collect, episode_spec
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime import seeds
+from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.config import Outcome, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES
 from touchgoal.sim_envs.experts.pick_place_plans import LONGEST_PLAN
@@ -70,16 +71,22 @@ class Recorded:
     scene: Scene
 
 
-@runtime_checkable
-class Sizes(Protocol):
-    """Numbers of episodes."""
+@checked_dataclass
+class Sizes:
+    """Numbers of episodes in each scene."""
 
-    training: int
-    goals: int  # of each object
-    calibration: int
-    successes: int
-    suboptimal: int  # of either kind
-    episodes: int  # of each kind of failure
+    episodes: Count = 30
+    """Judged episodes of each kind of failure."""
+    suboptimal: Count = 30
+    """Judged episodes of either poor success."""
+    successes: Count = 100
+    """Judged successes."""
+    training: Count = 60
+    """Successes of the training objects that fit units and value."""
+    goals: Count = 3
+    """Successes of each judged object whose ends are its goals."""
+    calibration: Count = 30
+    """Successes of the judged objects that set the success threshold."""
 
 
 def plan(scene: Scene, sizes: Sizes) -> list[Wanted]:
@@ -122,11 +129,11 @@ def record(
 
 def _groups(env: PickPlaceConfig) -> list[tuple[str, PickPlaceConfig, tuple[Outcome, ...]]]:
     """Return the sets that a scene needs: name, environment and outcomes of each."""
-    slow, wrong = SUBOPTIMAL, ("wrong_object",)
-    usual = tuple(o for o in OUTCOMES if o not in (*slow, *wrong))
+    wrong: tuple[Outcome, ...] = ("wrong_object",)
+    usual: tuple[Outcome, ...] = tuple(o for o in OUTCOMES if o not in (*SUBOPTIMAL, *wrong))
     return [
         ("usual", env, usual),
-        ("slow", replace(env, max_seconds=LONGEST_PLAN), slow),
+        ("slow", replace(env, max_seconds=LONGEST_PLAN), SUBOPTIMAL),
         ("clutter", replace(env, distractors=1), wrong),
     ]
 
@@ -147,8 +154,10 @@ def _recorded(
     left = {w.first_seed: w.count for w in wanted}
     for name, _, _ in _groups(env):
         root = folder / f"{scene}-{name}"
-        episodes = EpisodeSet(root) if (root / INFO).exists() else None
-        for i in range(len(episodes) if episodes else 0):
+        if not (root / INFO).exists():
+            continue
+        episodes = EpisodeSet(root)
+        for i in range(len(episodes)):
             meta = episodes.meta(i)
             for w in wanted:
                 mine = meta["seed"] in w.seeds and meta["outcome"] == w.outcome
