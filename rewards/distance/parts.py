@@ -135,7 +135,7 @@ def part_costs(episode: EmbeddedEpisode, goal: EmbeddedGoal, units: Mapping[str,
     }
     if episode.readings is None or goal.readings is None:
         return costs
-    touching = episode.readings.touching.any(0)
+    touching = np.any(episode.readings.touching, axis=0, keepdims=True)[0]
     wanted = bool(goal.readings.touching.any())
     gated = {k: gate(c, touching, wanted) for k, c in costs.items() if k in TOUCH_PARTS}
     return costs | gated

@@ -141,9 +141,11 @@ class EpisodeEmbedder:
             if cameras or not sides:
                 raise UserError(missing_camera(source, self.camera, cameras))
         sensor = SENSORS.get(self.made_with.sensor)
-        for side in sides if sensor is not None else ():
-            check_untouched(touch_background(first[side]), sensor, f"{side} of {source}")
-        return FeatureStream(self, first, sides, fps, source)
+        for side in sides:
+            if sensor is not None:
+                check_untouched(touch_background(first[side]), sensor, f"{side} of {source}")
+        # one class by two paths
+        return FeatureStream(self, first, sides, fps, source)  # pyright: ignore[reportArgumentType]
 
     def source_of(self, sides: Sequence[str]) -> EmbeddingSource:
         """Return what embeddings of a trajectory with these fingertips are made with."""

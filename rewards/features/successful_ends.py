@@ -81,7 +81,8 @@ class SuccessfulEnds:
             "made_with": asdict(frames.made_with),
         }
         with atomic_write(path) as file, file.open("wb") as stream:
-            np.savez_compressed(stream, about=np.array(json.dumps(about)), **arrays)
+            arrays["about"] = np.array(json.dumps(about))
+            np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
 
     @classmethod
     def load(cls, path: Path) -> "SuccessfulEnds":
