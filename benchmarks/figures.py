@@ -103,6 +103,25 @@ def nearest(metrics: Metrics) -> str:
     return "; ".join(rows)
 
 
+def retrieved(metrics: Metrics) -> str:
+    """Mean average precision from touch to text of the first encoder, by split, beside chance."""
+    parts = []
+    for split in dict.fromkeys(row["split"] for row in metrics["rows"]):
+        rows = [row for row in metrics["rows"] if row["split"] == split]
+        chance = next(row for row in rows if row["row"] == "chance")["touch to text"][0]
+        own = next(row for row in rows if row["row"] not in ("chance", "raw pixels"))
+        figure = "{:.1f} [{:.1f}, {:.1f}]".format(*own["touch to text"])
+        parts.append(f"{split} {figure} (chance {chance:.1f})")
+    return "; ".join(parts)
+
+
+def named(metrics: Metrics, **inputs: str) -> str:
+    """Accuracy of the linear probe on whole visits held out, by label and input."""
+    rows = {row["input"]: row for row in metrics["rows"] if row["split"] == "press"}
+    figures = {label: rows[name]["probe"] for label, name in inputs.items()}
+    return "; ".join("{} {:.0f} % [{:.0f}, {:.0f}]".format(k, *v) for k, v in figures.items())
+
+
 def faults(metrics: Metrics) -> str:
     """Faults that lose no episode, and the longest time to rest."""
     rows = metrics["rows"]
