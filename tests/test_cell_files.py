@@ -128,7 +128,10 @@ def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
         (SIM.replace("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),
         (SIM.replace('_hand"', '_hand", force = 90'), "gripper.force must lie between 0 and 70 N"),
         (SIM + "safety = { force = true }", "safety.force must be a valid number, not True"),
-        (SIM + "safety = { force = nan }", "safety.force must be a finite number, not nan: Force"),
+        (
+            SIM + "safety = { force = nan }",
+            "safety.force must be a finite number, not nan: External",
+        ),
         (SIM + "safety = { velocity_share = 20 }", "safety.velocity_share must be less than or eq"),
         (SIM + "safety = { tip_speed = inf }", "safety.tip_speed must be a finite number, not inf"),
         (SIM + "safety = { velocity_share = 0 }", "safety.velocity_share must be greater than 0"),

@@ -6,6 +6,7 @@ fitted on the training touches map images and sentences to its frozen embeddings
 touch backbones that are trained on the same touches, as in the paper.
 """
 
+from collections.abc import Callable
 from dataclasses import field, replace
 from functools import partial
 from itertools import product
@@ -84,14 +85,7 @@ def run(config: Config) -> dict[str, Any]:
     for name in config.encoders:
         judged[name] = partial(_with_heads, name=name, config=config.heads)
         judged[f"{name}, without touch-text"] = partial(_with_heads, name=name, config=without)
-    once = {}
-    if config.trained:
-        towers = load_towers("offline")
-        touches = read_touch_data(WandSet.open(config.data), towers)
-    for backbone, weight in product(config.trained, (1.0, 0.0)):
-        align = AlignConfig(backbone=backbone, epochs=config.epochs, text_weight=weight)
-        without = "" if weight else ", without touch-text"
-        once[f"{backbone} trained{without}"] = partial(_trained, touches, towers, align)
+    once = _judges_that_train(config)
     rows, pools = [], {}
     work = list(product(config.splits, judged | once))
     for split, what in track(work, "retrieval", "row"):
@@ -123,6 +117,19 @@ def _with_heads(data: EmbeddedSet, fold: Fold, seed: int, name: str, config: Hea
     return judge(
         data, fold, {"touch": touch[fold.test].numpy(), "image": unit.numpy(), "text": text.numpy()}
     )
+
+
+def _judges_that_train(config: Config) -> dict[str, Callable[[EmbeddedSet, Fold, int], Found]]:
+    """Return the rows whose backbones are trained; the touches are read only if there are any."""
+    if not config.trained:
+        return {}
+    towers = load_towers("offline")
+    touches, rows = read_touch_data(WandSet.open(config.data), towers), {}
+    for backbone, weight in product(config.trained, (1.0, 0.0)):
+        align = AlignConfig(backbone=backbone, epochs=config.epochs, text_weight=weight)
+        without = "" if weight else ", without touch-text"
+        rows[f"{backbone} trained{without}"] = partial(_trained, touches, towers, align)
+    return rows
 
 
 def _trained(
