@@ -16,7 +16,7 @@ from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.features.contact_reading import ContactReadings
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
-from touchgoal.rewards.metrics import measure_curve
+from touchgoal.rewards.metrics import auc, measure_curve
 from touchgoal.rewards.reward_model import RewardModel
 from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
@@ -251,11 +251,10 @@ def _row(
     rng = np.random.default_rng(0)
     if metric == "AUC":
         good, bad = np.flatnonzero(~failed), np.flatnonzero(failed)
-        before, after = (_auc(m["last cost"], good, bad) for m in (real, replaced))
+        last, new = real["last cost"], replaced["last cost"]
+        before, after = auc(last[good], last[bad]), auc(new[good], new[bad])
         drawn = [(rng.choice(good, len(good)), rng.choice(bad, len(bad))) for _ in range(_DRAWS)]
-        changes = [
-            _auc(replaced["last cost"], *rows) - _auc(real["last cost"], *rows) for rows in drawn
-        ]
+        changes = [auc(new[g], new[b]) - auc(last[g], last[b]) for g, b in drawn]
         return AuditRow(metric, replacement, before, after, *_limits(np.array(changes)))
     both = np.isfinite(real[metric]) & np.isfinite(replaced[metric]) & ~failed
     before, after = real[metric][both], replaced[metric][both]
@@ -264,14 +263,6 @@ def _row(
     rows = rng.integers(len(before), size=(_DRAWS, len(before)))
     limits = _limits((after - before)[rows].mean(axis=1))
     return AuditRow(metric, replacement, float(before.mean()), float(after.mean()), *limits)
-
-
-def _auc(
-    cost: Float[np.ndarray, " n"], good: Int[np.ndarray, " a"], bad: Int[np.ndarray, " b"]
-) -> float:
-    """Return the share of pairs in which the failure costs more; ties count half."""
-    low, high = cost[good][:, None], cost[bad][None]
-    return float(np.mean((high > low) + 0.5 * (high == low)))
 
 
 def _limits(draws: Float[np.ndarray, " draws"]) -> tuple[float, float]:

@@ -5,6 +5,7 @@ Three modalities: "image" (camera image to goal image), "tactile" (touch to goal
 Without touch, and with towers that were trained together (a CLIP), a sentence is a goal for images.
 """
 
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -180,6 +181,19 @@ class Sentence:
         return f"text:{self.text}" + (f"|{self.baseline}" if self.baseline else "")
 
 
+def content_checksum(spec: "GoalSpec") -> str:
+    """Return a text that changes when what a goal refers to does: its picture, episodes or file."""
+    if isinstance(spec, EpisodeEnd):
+        return EpisodeSet(spec.root).episode_checksum(spec.index)
+    if isinstance(spec, Bank):
+        return EpisodeSet(spec.root).checksum
+    if isinstance(spec, GoalFile):
+        return hashlib.sha256(spec.path.read_bytes()).hexdigest()
+    if isinstance(spec, GoalPicture):
+        return hashlib.sha256(spec.read().tobytes()).hexdigest()
+    return str(spec)
+
+
 PictureGoal = OwnFrame | GoalPicture | EpisodeEnd | Bank | GoalFile | Sentence
 TouchGoal = OwnFrame | TouchArrays | EpisodeEnd | Bank | GoalFile
 GoalSpec = PictureGoal | TouchGoal
@@ -197,6 +211,12 @@ class Goal:
     def same_episode(self) -> frozenset[str]:
         """Modalities whose goal is a frame of the measured trajectory itself."""
         return frozenset(m for m in MODALITIES if isinstance(getattr(self, m), OwnFrame))
+
+    @property
+    def specs(self) -> list[GoalSpec]:
+        """Goals of all modalities that have one."""
+        given = (getattr(self, name) for name in MODALITIES)
+        return [spec for spec in given if spec is not None]
 
     def as_dict(self) -> dict[str, str]:
         """Return the goal of each modality that has one, in the form that a user writes."""

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal import __version__
+from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.episodes.schema import Episode
+from touchgoal.rewards.goals import GoalSpec, content_checksum
 from touchgoal.rewards.report.record import record_of
 from touchgoal.rewards.report.report import write_report
 from touchgoal.rewards.report.thumbnails import Thumbnails
@@ -46,6 +48,7 @@ class Measurement:
         """
         self._out, self._gamma = out, gamma
         self._models = {t.name: model_of(t) for t in trajectories}
+        self._contents: dict[str, str] = {}
         self._plotted = {t.name for t in trajectories[:plots]}
         self._paths = {t.name: self._path(t) for t in trajectories}
         self.missing = [t for t in trajectories if not self._paths[t.name].is_file()]
@@ -90,6 +93,13 @@ class Measurement:
             stale.unlink()
         record_of(curves, trajectory, thumbnails, self._gamma).save(path)
 
+    def _content(self, spec: GoalSpec) -> str:
+        """Return the checksum of a goal's content, read once: thousands of trajectories share it."""
+        key = str(spec)
+        if key not in self._contents:
+            self._contents[key] = content_checksum(spec)
+        return self._contents[key]
+
     def _path(self, trajectory: Trajectory) -> Path:
         """Return the path of a record, which names the recording and what it was measured with."""
         model = self._models[trajectory.name]
@@ -98,8 +108,9 @@ class Measurement:
             trajectory.checksum(),
             model.provenance(),
             model.goal.as_dict(),
+            [self._content(spec) for spec in model.goal.specs],
             repr(model.normalizer),
-            [weights.sum().item() for weights in model.value.parameters()] if model.value else [],
+            checksum(*(model.value.state_dict().values() if model.value else ())),
             self._gamma,
         ]
         digest = hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:12]

@@ -4,6 +4,7 @@ Undefined is None: a curve that does not change has no order. Ties share a rank.
 above the noise, eps = 3 sigma, with sigma measured before the contact.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -138,6 +139,15 @@ def find_peaks(d: Curve, eps: float) -> Int[np.ndarray, " peaks"]:
     curve's end (the topographic definition, of scipy.signal.peak_prominences).
     """
     return signal.find_peaks(d, prominence=eps)[0]
+
+
+def auc(
+    successes: Sequence[float] | Real[np.ndarray, " a"],
+    failures: Sequence[float] | Real[np.ndarray, " b"],
+) -> float:
+    """Return the share of pairs in which the failure costs more than the success; ties count half."""
+    low, high = np.asarray(successes)[:, None], np.asarray(failures)
+    return float(np.mean((high > low) + 0.5 * (high == low)))
 
 
 def spearman(x: Curve, y: Curve) -> float | None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 from test_episode_embedder import PaintTowers, recorded
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
@@ -21,7 +22,7 @@ from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.rewards.curves import Contact, Curves
 from touchgoal.rewards.default_goal import goals_of
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
-from touchgoal.rewards.goals import Bank, Goal, OwnFrame
+from touchgoal.rewards.goals import Bank, Goal, GoalPicture, OwnFrame
 from touchgoal.rewards.measure import Measurement, write_skipped
 from touchgoal.rewards.report.outcome_table import outcome_table
 from touchgoal.rewards.report.page import write_pages
@@ -46,11 +47,11 @@ def episodes(tmp_path: Path) -> Path:
     return tmp_path / "set"
 
 
-def measure(source: Path, out: Path) -> Measurement:
+def measure(source: Path, out: Path, model: RewardModel = MODEL) -> Measurement:
     trajectories = open_source(source, "front", with_touch=False).trajectories
-    measurement = Measurement(trajectories, lambda _: MODEL, out, gamma=1.0, plots=1)
+    measurement = Measurement(trajectories, lambda _: model, out, gamma=1.0, plots=1)
     measurement.run(workers=2)
-    report_all(measurement.records, out, MODEL.provenance())
+    report_all(measurement.records, out, model.provenance())
     return measurement
 
 
@@ -80,6 +81,19 @@ def test_an_interrupted_measurement_goes_on_to_the_same_files(
     assert contents(tmp_path / "resumed") == whole
     assert {"episode_000.png", "episode_003.csv", "frames.parquet", "report.html"} <= whole.keys()
     assert "episode_001.png" not in whole
+
+
+def test_another_picture_under_the_name_of_the_goal_is_measured_anew(
+    episodes: Path, tmp_path: Path
+) -> None:
+    picture, out = tmp_path / "goal.png", tmp_path / "out"
+    model = replace(MODEL, goal=Goal(image=GoalPicture(picture)))
+    ends = []
+    for frame in (0, -1):
+        Image.fromarray(EPISODE.frames[FRONT][frame]).save(picture)
+        measure(episodes, out, model)
+        ends.append(json.loads((out / "metrics.json").read_text()))
+    assert ends[0] != ends[1]
 
 
 def test_videos_are_found_by_what_their_names_show(

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from statistics import mean
 
-from scipy.stats import mannwhitneyu
-
+from touchgoal.rewards.metrics import auc
 from touchgoal.rewards.report.record import Facts
 
 _TITLE = "last cost by outcome, goals from other trajectories"
@@ -45,5 +44,4 @@ def outcome_table(facts: Sequence[Facts]) -> str:
 def _auc(failures: Sequence[float], successes: Sequence[float]) -> str:
     if not failures or not successes:
         return "-"
-    above = mannwhitneyu(failures, successes).statistic
-    return f"{above / (len(failures) * len(successes)):.2f}"
+    return f"{auc(successes, failures):.2f}"
