@@ -55,12 +55,12 @@ def _never_touch(frames: Frames, contact: int, other: Frames) -> Frames:
 
 
 def _freeze(frames: Frames, contact: int, other: Frames) -> Frames:
-    """Everything stands still from just before the contact."""
+    """Cameras and touch repeat the last frame before contact."""
     return _played(frames, np.minimum(np.arange(_length(frames)), contact - 1))
 
 
 def _drop(frames: Frames, contact: int, other: Frames) -> Frames:
-    """Half-way from contact to the end nothing is felt any more, and the cameras stand still."""
+    """From half-way between contact and the end on, touch is as without contact and the cameras show one frame."""
     lost = (contact + _length(frames)) // 2
     held = _played(frames, np.minimum(np.arange(_length(frames)), lost))
     return _touch(
@@ -85,7 +85,7 @@ def _over_press(frames: Frames, contact: int, other: Frames) -> Frames:
 
 
 def _wrong_object(frames: Frames, contact: int, other: Frames) -> Frames:
-    """The fingertips feel what they felt in another episode, stretched to this one's length."""
+    """Touch is that of another episode, stretched to this one's length."""
     missing = [key for key in TACTILE if key in frames and key not in other]
     if missing:
         raise UserError(f"the other episode has no {' and '.join(missing)}")

@@ -27,7 +27,7 @@ _CHUNK = 256  # frames in float32 at once
 
 @dataclass(frozen=True)
 class ValueConfig:
-    """What a value was fitted to."""
+    """Task, cameras and image network that a value was fitted to."""
 
     task: str  # see `task_of`
     cameras: tuple[str, ...]  # keys, in the order of the maps
