@@ -99,12 +99,12 @@ class _Session:
     def _save(self, touch: WandTouch | None) -> None:
         if touch is None:
             return
-        self._writer.append(wand_episode(touch, self._visit, self._recorder.wear))
+        self._writer.append(wand_episode(touch, self._visit, self._recorder.gel_wear))
         self._line.say(f"recorded {sum(self._recorder.counts)}: {touch.load[-1]:.1f} N")
 
     def _warn(self) -> None:
         """Print the gel's wear, once for each kind."""
-        wear = self._recorder.wear
+        wear = self._recorder.gel_wear
         kind = wear.kind if wear else ""
         if kind and kind != self._worn:
             self._line.say(f"{wear}; with a new one, start again with --new-gel")

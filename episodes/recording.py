@@ -15,7 +15,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import Description, EncodedEpisode, encode
-from touchgoal.episodes.outcomes.verify import came_out
+from touchgoal.episodes.outcomes.verify import outcome_reached
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
@@ -190,7 +190,7 @@ def _outcome(asked: Outcome, frames: dict[str, np.ndarray], success: bool) -> st
     """Return the requested outcome, or "failure" or `not_` and its name if it did not come about."""
     if asked == "success":
         return "success" if success else "failure"
-    return asked if came_out(asked, frames) else f"not_{asked}"
+    return asked if outcome_reached(asked, frames) else f"not_{asked}"
 
 
 def collect(

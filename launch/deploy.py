@@ -19,7 +19,7 @@ from touchgoal.runtime.option_types import Seed, checked_dataclass
 if TYPE_CHECKING:
     from touchgoal.control.cell.config import CellConfig
     from touchgoal.control.cell.connection import CellConnection
-    from touchgoal.control.deployment.actors import CellPolicy
+    from touchgoal.control.deployment.actors import DeployedPolicy
     from touchgoal.control.deployment.session import Result
 
 NOT_DONE, STOPPED = 3, 4  # exit status
@@ -72,7 +72,7 @@ def main(config: Config) -> None:
     _report(result, out)
 
 
-def load_policy(cell: "CellConfig") -> "CellPolicy | None":
+def load_policy(cell: "CellConfig") -> "DeployedPolicy | None":
     """Return the cell's policy, None for a scripted actor; UserError if it does not fit."""
     from touchgoal.control.deployment.actors import SCRIPTED, load_user_policy
     from touchgoal.sim_envs.twin.cell_task import env_config_of
@@ -116,7 +116,7 @@ def _summary(cell: "CellConfig", config: Config) -> str:
 def _deploy(
     config: Config,
     cell: "CellConfig",
-    policy: "CellPolicy | None",
+    policy: "DeployedPolicy | None",
     cost: Any,
     connection: "CellConnection",
     episodes: Path,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.control.deployment.actors import CellPolicy
+from touchgoal.control.deployment.actors import DeployedPolicy
 from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.deployment.user_policy import Policy, UserPolicy, find_user_policy
 from touchgoal.episodes.recording import Actor
@@ -117,9 +117,9 @@ def follower(env: FrankaTactileEnv) -> WireFollower:
     return WireFollower(env.config.control_hz)
 
 
-def load_saved_policy(cell: CellConfig, task: TaskConfig) -> CellPolicy:
+def load_saved_policy(cell: CellConfig, task: TaskConfig) -> DeployedPolicy:
     """Return the policy on disk that the cell names; UserError if it does not fit."""
     shipped = cell.task.policy == "shipped"
     directory = SHIPPED_POLICIES[cell.task.name] if shipped else find_policy(cell.task.policy)
     policy = SavedPolicy(directory)()
-    return CellPolicy.fitting(cell, policy, policy.env_config(task))
+    return DeployedPolicy.for_cell(cell, policy, policy.env_config(task))

@@ -56,11 +56,11 @@ def simulate(config: RigConfig, index: int) -> Stroke:
     indenter = config.indenters[index % len(config.indenters)]
     friction = FRICTION * (1 + FRICTION_SPREAD * rng.uniform(-1, 1))
     load, moved, start, direction = _draw_path(config, sensor, friction, rng)
-    pulled, slip = shear_force(moved, load, sensor.shear_stiffness, friction)
+    shear, slip = shear_force(moved, load, sensor.shear_stiffness, friction)
     unit = rig_unit(config)
     bench = PressBench(_probe(indenter, friction), sensor, unit, config.shear_relief)
     frames, wrenches, fields = [], [], []
-    for pressed, way, pull in zip(load.tolist(), moved, pulled, strict=True):
+    for pressed, way, pull in zip(load.tolist(), moved, shear, strict=True):
         (x, y), (fx, fy) = (start + way * direction).tolist(), (pull * direction).tolist()
         bench.place(np.array([x, y, 0.0]))
         sensed = bench.sense(pressed, rng, (fx, fy), (x, y), -pressed / sensor.normal_stiffness)

@@ -91,7 +91,7 @@ def _slide(
     centre = place(pose[0])
     touched = bench.sense(load, np.random.default_rng(0), centre=centre, depth=depth).field
     radius = mean_radius(touched) if touched is not None else 0.0
-    pull, slip = pulled(pose * [1, 1, radius], sensor.shear_stiffness, FRICTION * load)
+    pull, slip = stick_slip_force(pose * [1, 1, radius], sensor.shear_stiffness, FRICTION * load)
     pull[:, 2] *= radius
     frames, wrenches = [], []
     for _ in range(REST):
@@ -107,7 +107,7 @@ def _slide(
     return Slide(np.stack(frames), wrench, slides, whole, body.kind.name, load)
 
 
-def pulled(
+def stick_slip_force(
     places: Float[np.ndarray, "t d"], stiffness: float, limit: float
 ) -> tuple[Float[np.ndarray, "t d"], Bool[np.ndarray, " t"]]:
     """Return forces (N) on a gel of `stiffness` N/m under an object at these places (m), and slip.

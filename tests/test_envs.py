@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 import touchgoal
 from touchgoal.control import features as ft
-from touchgoal.episodes.outcomes.verify import came_out
+from touchgoal.episodes.outcomes.verify import outcome_reached
 from touchgoal.episodes.recording import EpisodeSpec, episode_spec, record_episode
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
@@ -183,7 +183,7 @@ def test_outcomes_to_order(outcome: Outcome) -> None:
     assert episode.meta["outcome"] == outcome
     plain = record_episode(PickPlace(config), EpisodeSpec(2, "success", spec.options))
     alike = ("success", "slow", "same_shape")  # as success, or with success's plan
-    assert came_out(outcome, plain.frames) == (outcome in alike)
+    assert outcome_reached(outcome, plain.frames) == (outcome in alike)
 
 
 @pytest.mark.parametrize("name", ["glass_ball", "wooden_block", "pebble", "sausage"])

@@ -12,7 +12,7 @@ from in_process import in_process_workers
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet
 from touchgoal.benchmarks.papers.mmwand.retrieval import PUBLISHED, judge
 from touchgoal.encoders.alignment.config import HeadsConfig
-from touchgoal.encoders.alignment.heads import Paired, fit_heads
+from touchgoal.encoders.alignment.heads import PairedEmbeddings, fit_heads
 from touchgoal.encoders.alignment.splits import SPLITS, Fold, split_touches
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
@@ -93,7 +93,7 @@ def test_retrieval_knows_the_right_answer_and_chance() -> None:
 def test_heads_bring_words_and_pictures_to_touch() -> None:
     data = made_up()
     touch = F.normalize(torch.from_numpy(data.touch["touch"]), dim=1)
-    paired = Paired(
+    paired = PairedEmbeddings(
         touch=touch,
         label=torch.from_numpy(data.label),
         image=torch.from_numpy(data.image),

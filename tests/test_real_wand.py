@@ -18,7 +18,7 @@ import pytest
 from in_process import in_process_workers
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.wand import Moment
+from touchgoal.control.cell.wand import WandReading
 from touchgoal.control.cell.wand_recorder import WandRecorder, evenly_loaded
 from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
@@ -224,7 +224,7 @@ def test_mistakes_are_one_line(options: list[str], message: str, tmp_path: Path)
 
 
 class Hand:
-    """Feeds a recorder with moments of a press; the gel may have a scratch."""
+    """Feeds a recorder with readings of a press; the gel may have a scratch."""
 
     def __init__(self, ramp: np.ndarray) -> None:
         self.recorder, self.scratch = WandRecorder(GELSIGHT_MINI), 0
@@ -238,20 +238,22 @@ class Hand:
             picture = self._ramp[int(np.ceil(seen / 4))] + self._rng.normal(0, 1, (240, 320, 3))
             picture[100:102, 60:160] += self.scratch
             view = {"top": np.full((2, 2, 3), int(force > 0), np.uint8)}
-            moment = Moment(np.clip(picture, 0, 255).astype(np.uint8), view, float(force) + 0.4)
-            made.append(self.recorder.update(moment))
+            reading = WandReading(
+                np.clip(picture, 0, 255).astype(np.uint8), view, float(force) + 0.4
+            )
+            made.append(self.recorder.update(reading))
         return [one for one in made if one is not None]
 
 
 def test_a_gel_that_a_press_scratches_is_said(ramp: np.ndarray) -> None:
     hand, press = Hand(ramp), [2.0, 4, 6, 8, 10, 12, 12, 12, 12, 12]
     assert hand.feel(*[0.0] * 15) == []
-    assert len(hand.feel(*press, *[0.0] * 15)) == 1 and hand.recorder.wear is None
+    assert len(hand.feel(*press, *[0.0] * 15)) == 1 and hand.recorder.gel_wear is None
     hand.scratch = -20
     (made,) = hand.feel(*press, *[0.0] * 15)
-    assert isinstance(made, WandTouch) and hand.recorder.wear is not None
-    assert "the gel looks scratched" in str(hand.recorder.wear)
-    assert "put on a new gel" in str(hand.recorder.wear)
+    assert isinstance(made, WandTouch) and hand.recorder.gel_wear is not None
+    assert "the gel looks scratched" in str(hand.recorder.gel_wear)
+    assert "put on a new gel" in str(hand.recorder.gel_wear)
     assert hand.recorder.counts == [0, 0, 2] and "press with 0 to 5 N" in hand.recorder.hint
     assert len(hand.feel(*press, *[0.0] * 15)) == 1  # a worn gel goes on, if the person does
 

@@ -33,9 +33,9 @@ from touchgoal.sim_envs.indenter_rig import REST, rig_unit, shear_force, simulat
 from touchgoal.sim_envs.object_slides import (
     FRAMES,
     mean_radius,
-    pulled,
     simulate_catalogue_slide,
     simulate_slide,
+    stick_slip_force,
 )
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
@@ -162,7 +162,7 @@ def test_a_probe_finds_the_one_token_that_matters() -> None:
 
 def test_a_slide_pulls_at_the_gel_up_to_the_cone() -> None:
     places = np.array([[0.0, 0.0], [1e-4, 0.0], [3e-4, 0.0], [2e-4, 0.0], [2e-4, 4e-4]])
-    force, slip = pulled(places, stiffness=1e4, limit=2.0)
+    force, slip = stick_slip_force(places, stiffness=1e4, limit=2.0)
     # 1 N; 3 N is too much; back by 0.1 mm: 1 N less; across: (1, 4) N cut to 2 N
     assert force[:4, 0] == pytest.approx([0, 1, 2, 1]) and slip.tolist() == [0, 0, 1, 0, 1]
     assert np.linalg.norm(force[4]) == pytest.approx(2) and force[4, 1] / force[

@@ -72,7 +72,7 @@ class EncoderSpeed:
     batched: float  # frames a second in batches of prepared input
     batched_ratio: float | None  # the same over the peer's
     tick: float  # ms from a raw frame to its embedding, with cached preprocessing
-    tick_anew: float  # the same without the cache
+    tick_uncached: float  # the same without the cache
     tick_ratio: float | None  # the peer's time over `tick`
 
 
@@ -113,17 +113,21 @@ def _measure(name: str, encoder: BaseTouchEncoder, precision: str, config: Confi
         plain = _Peer(vit_of(encoder).config).eval().to(dtype)
         encoder = copy.deepcopy(encoder).to(dtype)
     stream = _Stream(encoder, dtype)
-    batch = stream.anew().expand(config.batch_size, *[-1] * (stream.anew().ndim - 1)).contiguous()
+    batch = (
+        stream.uncached()
+        .expand(config.batch_size, *[-1] * (stream.uncached().ndim - 1))
+        .contiguous()
+    )
     batched: list[Callable[[], object]] = [lambda: encoder.embed_touch(batch)]
     ticks: list[Callable[[], object]] = [
         lambda: encoder.embed_touch(stream.cached()),
-        lambda: encoder.embed_touch(stream.anew()),
+        lambda: encoder.embed_touch(stream.uncached()),
     ]
     if plain is not None:
         batched += [partial(_plainly, plain, lambda: batch, fused) for fused in (True, False)]
-        ticks += [partial(_plainly, plain, stream.anew, fused) for fused in (True, False)]
+        ticks += [partial(_plainly, plain, stream.uncached, fused) for fused in (True, False)]
     ours, *peer = in_turn(batched, config.repeats)
-    cached, anew, *peers_tick = in_turn(ticks, config.repeats * config.ticks)
+    cached, uncached, *peers_tick = in_turn(ticks, config.repeats * config.ticks)
     return EncoderSpeed(
         encoder=name,
         parameters=sum(p.numel() for p in encoder.parameters()) / 1e6,
@@ -131,7 +135,7 @@ def _measure(name: str, encoder: BaseTouchEncoder, precision: str, config: Confi
         batched=config.batch_size / ours,
         batched_ratio=min(peer) / ours if peer else None,
         tick=1e3 * cached,
-        tick_anew=1e3 * anew,
+        tick_uncached=1e3 * uncached,
         tick_ratio=min(peers_tick) / cached if peers_tick else None,
     )
 
@@ -182,7 +186,7 @@ class _Stream:
         frames = [self._frames[(self._newest - k) % _STREAM] for k in range(back, -1, -1)]
         return self._stacked(self._recent.latest(frames, self._frames[0]))
 
-    def anew(self) -> torch.Tensor:
+    def uncached(self) -> torch.Tensor:
         """Return the next frame's input with everything preprocessed."""
         self._newest += 1
         rows = [(self._newest - back) % _STREAM for back in self._encoder.offsets]
@@ -203,7 +207,7 @@ def _table(rows: list[EncoderSpeed], config: Config) -> str:
     ]
     lines += [
         f"{row.encoder[-29:]:<30}{row.parameters:>8.2f}{row.precision:>6}{row.batched:>10.1f}"
-        f"{_ratio(row.batched_ratio)}{row.tick:>11.2f}{f'({row.tick_anew:.2f})':>9}{_ratio(row.tick_ratio)}"
+        f"{_ratio(row.batched_ratio)}{row.tick:>11.2f}{f'({row.tick_uncached:.2f})':>9}{_ratio(row.tick_ratio)}"
         for row in rows
     ]
     lines.append(

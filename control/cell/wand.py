@@ -74,7 +74,7 @@ class WandConfig:
 
 
 @plain_dataclass(frozen=True, eq=False)
-class Moment:
+class WandReading:
     """One reading of all devices: RGB picture of the gel, view -> RGB, force of the load cell (N)."""
 
     picture: Picture
@@ -91,14 +91,14 @@ class Wand:
     load_cell: LoadCell
     _last: int = field(default=-1, init=False)
 
-    def read(self) -> Moment | None:
+    def read(self) -> WandReading | None:
         """Return the readings, or None until the gel's next picture; DriverError as the devices."""
         frame = self.gel.read()
         if frame.sequence == self._last:
             return None
         self._last = frame.sequence
         views = {name: _square(camera.read().image) for name, camera in self.cameras.items()}
-        return Moment(frame.image, views, self.load_cell.read().force)
+        return WandReading(frame.image, views, self.load_cell.read().force)
 
     def problem(self) -> str:
         """Say which device has sent nothing new for half a second; "" if none."""

@@ -1,7 +1,7 @@
 """Recording of touches that a person makes with a real wand, picked from its devices' readings.
 
 Contact begins when load cell and gel both show it, and ends when either no longer does. The load cell's
-free-air reading is subtracted: the head's weight on it changes with the wand's tilt.
+load in free air is subtracted: the head's weight on it changes with the wand's tilt.
 """
 
 from collections import deque
@@ -10,25 +10,25 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.arrays import Picture
-from touchgoal.control.cell.wand import Moment
+from touchgoal.control.cell.wand import WandReading
 from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.contact import ContactDetector, threshold_for
 from touchgoal.control.tactile.gel_wear import GelWear, find_wear
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.control.wand_touch import CLIP, FORCE_RANGES, MAX_FORCE, WandTouch, force_range
 
-_CONTACT = 0.3  # N above the free-air reading; an HX711's noise is 0.005
+_CONTACT = 0.3  # N above the load in free air; an HX711's noise is 0.005
 _LEAST_FORCE = 0.5  # N of a touch
-_BEFORE = 25  # moments, 1 s of a Mini: then the wand is still centimetres from the object
-_SETTLING = 12  # moments without a change, after a touch or at the start
+_BEFORE = 25  # readings, 1 s of a Mini: then the wand is still centimetres from the object
+_SETTLING = 12  # readings without a change, after a touch or at the start
 _PART = 5  # first and last of them that are compared
 _SETTLED = 1.5  # counts of local change between their medians; a compressed stream is never still
-_LASTING = 10  # moments of disagreement between gel and load cell before the hint says so
-# Share by which the free-air reading follows a force without a touch, each moment: the wand was tilted.
+_LASTING = 10  # readings of disagreement between gel and load cell before the hint says so
+# Share of a force without a touch added to the free-air load per reading: the wand was tilted.
 _TURNED = 0.02
-_HELD = 5  # moments near the largest force
+_HELD = 5  # readings near the largest force
 _NEAR = 0.1  # share below the largest force that counts as near
-_LONGEST = 250  # moments of a touch
+_LONGEST = 250  # readings of a touch
 
 
 class WandRecorder:
@@ -38,7 +38,7 @@ class WandRecorder:
         hint: for the person who presses.
         force: on the gel, N; 0 in free air.
         counts: touches in each of the paper's ranges of force.
-        wear: wear of the gel when it was last seen untouched.
+        gel_wear: wear of the gel when it was last seen untouched.
     """
 
     def __init__(
@@ -47,36 +47,36 @@ class WandRecorder:
         """`first`: first untouched picture of this gel, None if new; `counts`: touches per range."""
         self.hint, self.force = "leave the gel untouched", 0.0
         self.counts = list(counts)
-        self.wear: GelWear | None = None
+        self.gel_wear: GelWear | None = None
         self._sensor, self._first = sensor, first
-        self._free: deque[Moment] = deque(maxlen=_BEFORE)  # untouched, since the last touch
+        self._free: deque[WandReading] = deque(maxlen=_BEFORE)  # untouched, since the last touch
         self._detector: ContactDetector | None = None  # None until the gel has settled
-        self._air = 0.0  # the load cell's free-air reading, N
+        self._air = 0.0  # the load cell's force in free air, N
         self._press: list[tuple[Picture, float]] = []
-        self._disagreed = 0  # moments in a row at which gel and load cell disagree
-        self._before: Moment | None = None
-        self._peak: Moment | None = None
+        self._disagreed = 0  # readings in a row at which gel and load cell disagree
+        self._before: WandReading | None = None
+        self._peak: WandReading | None = None
         self._made: WandTouch | None = None  # a finished touch, until the gel has been checked
 
-    def update(self, moment: Moment) -> WandTouch | str | None:
-        """Process the next moment; return a touch when the gel has settled after it.
+    def update(self, reading: WandReading) -> WandTouch | str | None:
+        """Process the next reading; return a touch when the gel has settled after it.
 
         A text says why a touch does not count.
         """
-        self.force = moment.force - self._air
+        self.force = reading.force - self._air
         if self._detector is None:
-            return self._settle(moment)
-        touching = self._detector.update(moment.picture)
+            return self._settle(reading)
+        touching = self._detector.update(reading.picture)
         if self._press:
-            return self._follow(moment, touching)
+            return self._follow(reading, touching)
         elif touching and self.force > _CONTACT:
-            self._before, self._peak = self._free[0], moment
-            self._press = [(moment.picture, self.force)]
+            self._before, self._peak = self._free[0], reading
+            self._press = [(reading.picture, self.force)]
         elif touching or self.force > _CONTACT:
             self._disagree(touching)
         else:
             self._disagreed = 0
-            self._free.append(moment)
+            self._free.append(reading)
             self._air = float(np.median([free.force for free in self._free]))
             self.hint = self._wanted()
         return None
@@ -104,8 +104,8 @@ class WandRecorder:
             self._end_press()
         return self.drop("ended")
 
-    def _settle(self, moment: Moment) -> WandTouch | None:
-        self._free.append(moment)
+    def _settle(self, reading: WandReading) -> WandTouch | None:
+        self._free.append(reading)
         recent = list(self._free)[-_SETTLING:]
         if len(recent) < _SETTLING:
             return None
@@ -118,7 +118,7 @@ class WandRecorder:
             return None
         middle = np.median(pictures, 0).astype(np.uint8)
         self._first = middle if self._first is None else self._first
-        self.wear = find_wear(middle, self._first, self._sensor)
+        self.gel_wear = find_wear(middle, self._first, self._sensor)
         threshold = threshold_for(pictures, middle)
         self._detector = ContactDetector(Background(middle[None]), threshold)
         self._free = deque(recent, maxlen=_BEFORE)
@@ -133,15 +133,15 @@ class WandRecorder:
             self.counts[force_range(float(made.load[-1]))] += 1
         return made
 
-    def _follow(self, moment: Moment, touching: bool) -> str | None:
+    def _follow(self, reading: WandReading, touching: bool) -> str | None:
         """Follow a touch from contact to the lift."""
         if not touching or self.force < _CONTACT / 2:
             return self._end_press()
         largest = max(force for _, force in self._press)
         if len(self._press) < _LONGEST:
-            self._press.append((moment.picture, self.force))
+            self._press.append((reading.picture, self.force))
             if self.force > largest:
-                self._peak, largest = moment, self.force
+                self._peak, largest = reading, self.force
         if largest > MAX_FORCE:
             self.hint = f"too hard, lift: {MAX_FORCE:g} N at most"
         else:
@@ -188,11 +188,11 @@ class WandRecorder:
 
 
 def evenly_loaded(forces: Float[np.ndarray, " n"], count: int) -> list[int]:
-    """Return the indices of `count` moments, in order, whose forces rise evenly to the last one."""
+    """Return the indices of `count` readings, in order, with forces rising evenly to the last."""
     chosen: list[int] = []
     for k in range(1, count):
         first = chosen[-1] + 1 if chosen else 0
-        last = len(forces) - (count - k)  # leaves one moment for each later choice
+        last = len(forces) - (count - k)  # leaves one reading for each later choice
         aim = forces[-1] * k / count
         chosen.append(first + int(np.abs(forces[first:last] - aim).argmin()))
     return [*chosen, len(forces) - 1]

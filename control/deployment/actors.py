@@ -35,14 +35,16 @@ class PolicyNeeds(Protocol):
 
 
 @dataclass(frozen=True)
-class CellPolicy:
+class DeployedPolicy:
     """A policy that fits a cell, loaded for one run; it sees camera images of (rows, columns)."""
 
     planner: ChunkPlanner
     camera_size: tuple[int, int]
 
     @classmethod
-    def fitting(cls, cell: CellConfig, planner: ChunkPlanner, needs: PolicyNeeds) -> "CellPolicy":
+    def for_cell(
+        cls, cell: CellConfig, planner: ChunkPlanner, needs: PolicyNeeds
+    ) -> "DeployedPolicy":
         """Return the policy; UserError if the cell lacks a sensor that it needs."""
         if cell.arm == "ur5e":
             raise UserError(
@@ -56,19 +58,19 @@ class CellPolicy:
         return cls(planner, needs.camera_size)
 
 
-def load_user_policy(cell: CellConfig, options: PolicyNeeds) -> CellPolicy | None:
+def load_user_policy(cell: CellConfig, options: PolicyNeeds) -> DeployedPolicy | None:
     """Return the cell's policy if it is a user's class; UserError if it does not fit the cell.
 
     It may change the `options` of its environment.
     """
     if (found := find_user_policy(cell.task.policy)) is None:
         return None
-    return CellPolicy.fitting(cell, found(), found.env_config(options))
+    return DeployedPolicy.for_cell(cell, found(), found.env_config(options))
 
 
 def make_actor(
     cell: CellConfig,
-    policy: CellPolicy | None,
+    policy: DeployedPolicy | None,
     safety: ActionFilter,
     truth: Callable[[], dict[str, Any]] | None,
     commanded: Callable[[], np.ndarray],

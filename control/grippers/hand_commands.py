@@ -11,7 +11,7 @@ from typing import Literal
 
 PERIOD = 0.05  # s between looks at the hand
 SPEED = 0.1  # m/s; the hand's fastest
-SHUT = 2e-3  # m: least change of width that is sent; narrower targets are grasps
+CLOSED_WIDTH = 2e-3  # m: narrower targets are grasps; smaller changes are not sent
 _MOST_PASSING = 3  # looks in a row that a changing target is waited for
 
 LastCommand = Literal["runs", "arrived", "stopped short"]
@@ -48,17 +48,17 @@ class HandCommands:
         met, self._moves_inwards = self._moves_inwards and last == "stopped short", False
         if met:
             return HandCommand(self._sent, grasp=True)
-        if passes or abs(target - self._sent) <= SHUT:
+        if passes or abs(target - self._sent) <= CLOSED_WIDTH:
             return None
         self._sent = target
         if grasped and target < width:
             return None  # the grasp goes on: it holds by force
-        self._moves_inwards = SHUT < target < width
-        return HandCommand(target, grasp=target <= SHUT)
+        self._moves_inwards = CLOSED_WIDTH < target < width
+        return HandCommand(target, grasp=target <= CLOSED_WIDTH)
 
     def _passes(self, target: float) -> bool:
         """Return whether the target still changes faster than the hand can move."""
         changed, self._last_target = abs(target - self._last_target), target
-        passes = target > SHUT and changed > SPEED * PERIOD
+        passes = target > CLOSED_WIDTH and changed > SPEED * PERIOD
         self._passing = self._passing + 1 if passes else 0
         return 0 < self._passing <= _MOST_PASSING

@@ -21,7 +21,7 @@ COMMAND, STATUS = 0x03E8, 0x07D0  # first registers written and read; 6 bytes ea
 ACTIVATE, GO = 0x01, 0x08  # bits of the first command byte
 ACTIVE = 3  # status of a finished activation: bits 4 and 5 of the first status byte
 MOVING, STOPPED_OPENING, STOPPED_CLOSING, ARRIVED = range(4)  # of an object: bits 6 and 7
-SILENCE = 0x09  # fault after a second without messages: ignored, because any message ends it
+NO_MESSAGES = 0x09  # fault after a second without messages: ignored, because any message ends it
 POSITIONS = 3, 230  # counts fully open and closed, between which the stroke is linear
 SPEEDS = 0.020, ROBOTIQ_2F85.speed  # m/s for 0 to 255
 FORCES = ROBOTIQ_2F85.force  # N for 0 to 255
@@ -148,7 +148,7 @@ class Robotiq:
         return GripperReading(
             width=float(np.interp(status[4], POSITIONS, self.config.widths)),
             grasped=status[0] >> 6 in (STOPPED_OPENING, STOPPED_CLOSING),
-            fault=_FAULTS.get(code, f"fault {code:#04x}") if code not in (0, SILENCE) else "",
+            fault=_FAULTS.get(code, f"fault {code:#04x}") if code not in (0, NO_MESSAGES) else "",
             stamp=time.monotonic(),
         )
 

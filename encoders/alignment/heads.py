@@ -16,7 +16,7 @@ from touchgoal.encoders.alignment.infonce import symmetric_info_nce
 
 
 @dataclass(frozen=True, eq=False)
-class Paired:
+class PairedEmbeddings:
     """n touches, v views of the first k of them, and m sentences on their o objects."""
 
     touch: Float[Tensor, "n d"]  # unit touch embeddings
@@ -50,7 +50,7 @@ class Heads(nn.Module):
         return F.normalize(self.text(F.normalize(embeddings, dim=-1) - self.text_mean), dim=-1)
 
 
-def fit_heads(data: Paired, config: HeadsConfig, seed: int) -> Heads:
+def fit_heads(data: PairedEmbeddings, config: HeadsConfig, seed: int) -> Heads:
     """Fit heads by InfoNCE between touch and image, touch and text, and image and text.
 
     Touches, views and sentences of the same object all count as positives.
@@ -75,7 +75,11 @@ def fit_heads(data: Paired, config: HeadsConfig, seed: int) -> Heads:
 
 
 def _loss(
-    heads: Heads, data: Paired, rows: Int[Tensor, " b"], config: HeadsConfig, draw: torch.Generator
+    heads: Heads,
+    data: PairedEmbeddings,
+    rows: Int[Tensor, " b"],
+    config: HeadsConfig,
+    draw: torch.Generator,
 ) -> Float[Tensor, ""]:
     """Return the loss of a batch; touches without views take part in touch and text alone."""
     sentence, label, tau = _draw_sentences(data, rows, draw), data.label[rows], config.temperature
@@ -92,7 +96,7 @@ def _loss(
 
 
 def _draw_sentences(
-    data: Paired, rows: Int[Tensor, " b"], draw: torch.Generator
+    data: PairedEmbeddings, rows: Int[Tensor, " b"], draw: torch.Generator
 ) -> Int[Tensor, " b"]:
     """Draw one sentence for each touch."""
     describes = data.describes[data.label[rows]].float()

@@ -11,7 +11,7 @@ from torch import Tensor
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.green_screen import background_changer
-from touchgoal.encoders.alignment.heads import Heads, Paired, fit_heads
+from touchgoal.encoders.alignment.heads import Heads, PairedEmbeddings, fit_heads
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.towers.towers import Towers
@@ -55,7 +55,7 @@ def add_words(
     describes[:o, :m] = data.describes
     describes[o:, m:] = [[text in own for text in texts] for own in sentences]
     labels = np.concatenate([data.label[visible], o + np.repeat(np.arange(k), _PRESSES)])
-    paired = Paired(
+    paired = PairedEmbeddings(
         touch=F.normalize(torch.cat([touch[visible], pressed]), dim=1),
         label=torch.from_numpy(labels),
         image=torch.from_numpy(data.embed_views(towers, behind)[visible]),

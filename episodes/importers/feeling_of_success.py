@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.episodes.importers.labels import entry, truths
+from touchgoal.episodes.importers.labels import booleans, entry
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import TouchClip, check_sensor, encoded_pictures
 from touchgoal.runtime.errors import UserError
@@ -62,7 +62,7 @@ def _files(folder: Path) -> list[Path]:
 
 def _read(path: Path, sensor: str) -> Iterator[GraspTrial]:
     value = read_plain_pickle(path)
-    held = truths(_plain(entry(value, "is_gripping", str(path))), f"'is_gripping' of {path}")
+    held = booleans(_plain(entry(value, "is_gripping", str(path))), f"'is_gripping' of {path}")
     names = _plain(entry(value, "object_name", str(path)))
     columns = {
         (finger, moment): encoded_pictures(entry(value, key, str(path)), f"'{key}' of {path}")

@@ -45,7 +45,7 @@ def whole_numbers(value: Any, most: int, name: str) -> Int64[np.ndarray, " n"]:
     return array.astype(np.int64)
 
 
-def truths(value: Any, name: str) -> Bool[np.ndarray, " n"]:
+def booleans(value: Any, name: str) -> Bool[np.ndarray, " n"]:
     """Return a row of booleans, also from zeros and ones."""
     return whole_numbers(value, 1, name).astype(bool)
 

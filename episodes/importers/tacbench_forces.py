@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from touchgoal.episodes.importers.labels import entry, numbers, truths, whole_numbers
+from touchgoal.episodes.importers.labels import booleans, entry, numbers, whole_numbers
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import TouchClip, check_sensor, read_pictures
 from touchgoal.runtime.errors import UserError
@@ -95,7 +95,7 @@ def _read_batch(batch: Path, sensor: str | None) -> Iterator[ForceStroke]:
     pictures = [picture for path in shards for picture in read_pictures(path)]
     labels = read_plain_pickle(batch / _LABELS)
     name = str(batch / _LABELS)
-    touched = truths(entry(labels, "in_contact", name), f"'in_contact' of {name}")
+    touched = booleans(entry(labels, "in_contact", name), f"'in_contact' of {name}")
     if len(touched) != len(pictures):
         raise UserError(
             f"{batch} holds {len(pictures)} images, {_LABELS} labels {len(touched)}: get all its files"
@@ -131,7 +131,7 @@ def _trajectories(labels: Any, name: str, pictures: int) -> Iterator[tuple[str, 
         )
         n = len(force)
         rows = whole_numbers(entry(stroke, "indexes", own), pictures - 1, f"indexes {own}")
-        slip = truths(entry(stroke, "slip_label", own), f"slip labels {own}")
+        slip = booleans(entry(stroke, "slip_label", own), f"slip labels {own}")
         if len(rows) not in (n, n + STRIDE) or len(slip) < n:
             raise UserError(
                 f"stroke {key} in {name} has {len(rows)} images, {n} forces and {len(slip)} slip "

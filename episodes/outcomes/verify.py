@@ -70,7 +70,7 @@ def read_truth(frames: Mapping[str, np.ndarray]) -> Truth:
     )
 
 
-def came_out(outcome: Outcome, frames: Mapping[str, np.ndarray]) -> bool:
+def outcome_reached(outcome: Outcome, frames: Mapping[str, np.ndarray]) -> bool:
     """Return whether an episode ended as its expert was asked to end it."""
     return bool(_CHECKS[outcome](read_truth(frames)))
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from touchgoal.control import features as ft
-from touchgoal.control.grippers.hand_commands import PERIOD, SHUT, HandCommands, LastCommand
+from touchgoal.control.grippers.hand_commands import CLOSED_WIDTH, PERIOD, HandCommands, LastCommand
 from touchgoal.control.motion.tracker import SERVO_DAMPING, ServoLag, Tracker
 from touchgoal.control.safety.action_filter import ActionFilter, Measurements
 from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench
@@ -108,7 +108,7 @@ class DeployedHand:
                 self._last = "arrived"
             elif abs(self.width - before) < _STILL:
                 self._last = "stopped short"
-        grasped = self._grasps and self._last != "runs" and self.width > SHUT
+        grasped = self._grasps and self._last != "runs" and self.width > CLOSED_WIDTH
         target = min(max(target_width, 0.0), self._env.robot.tool.stroke[1])
         command = self._commands.next(target, self.width, grasped, self._last)
         if command is not None:

@@ -69,7 +69,7 @@ class ContactReader:
             self._is_robot,
             pads,
             data.site_xpos[[*self._sensors, self._tcp]],
-            Moving(model.geom_bodyid, model.body_rootid, data.cvel, data.subtree_com),
+            BodyMotion(model.geom_bodyid, model.body_rootid, data.cvel, data.subtree_com),
         )
         solved = contacts.efc_address >= 0
 
@@ -114,7 +114,7 @@ class Contacts(NamedTuple):
     sizes: Int[np.ndarray, " k"]
 
 
-class Moving(NamedTuple):
+class BodyMotion(NamedTuple):
     """Bodies of geoms, and velocities of bodies about their tree's centre of mass."""
 
     bodies: Int[np.ndarray, " geoms"]

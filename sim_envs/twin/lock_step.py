@@ -93,7 +93,7 @@ class LockStep:
         if self._arm.link.frozen or self._impatient:
             return True
         commanded = self._hand.commands - self._commands_before >= self._issued
-        return commanded and self._arm.answered and (self._arm.obeys or not self._driven)
+        return commanded and self._arm.answered and (self._arm.follows_commands or not self._driven)
 
     @property
     def _impatient(self) -> bool:

@@ -37,8 +37,8 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Moment:
-    """Images to take."""
+class RenderRequest:
+    """Images to render, and the state to render them from."""
 
     due: tuple[str, ...]  # names of the streams that are to have one
     state: Float[np.ndarray, " n"]  # physics state (`STATE`)
@@ -62,12 +62,12 @@ class PictureTaker:
         shape = *scene.camera_size, 3
         self._noise = self._noise_rng.normal(0.0, _CAMERA_NOISE, shape).astype(np.float32)
 
-    def follow(self, moment: Moment) -> None:
+    def follow(self, request: RenderRequest) -> None:
         """Take over the physics' state."""
         model, data = self._scene.model, self._data
-        mujoco.mj_setState(model, data, moment.state, STATE)
+        mujoco.mj_setState(model, data, request.state, STATE)
         mujoco.mj_forward(model, data)
-        self._contacts = moment.contacts
+        self._contacts = request.contacts
 
     def take(self, name: str) -> Picture:
         """Render a camera's or a fingertip's image."""
@@ -92,8 +92,8 @@ class PictureTaker:
 def serve(pipe: Connection, host: str, port: int, names: list[str]) -> None:
     """Render images on request until the twin has gone.
 
-    First answers with the port (`port` 0: any that is free) or an OSError; then each Moment with
-    the number of images sent on each stream and the processor time (s), so far.
+    First answers with the port (`port` 0: any that is free) or an OSError; then each RenderRequest
+    with the number of images sent on each stream and the processor time (s), so far.
     """
     streams = {name: Stream() for name in names}
     try:
@@ -104,7 +104,7 @@ def serve(pipe: Connection, host: str, port: int, names: list[str]) -> None:
     pipe.send(server.port)
     taker: PictureTaker | None = None
     while True:
-        message: Scene | Moment | Fault = pipe.recv()
+        message: Scene | RenderRequest | Fault = pipe.recv()
         if isinstance(message, tuple):
             name, kind, until = message
             setattr(streams[name], kind, until)
@@ -119,15 +119,15 @@ def serve(pipe: Connection, host: str, port: int, names: list[str]) -> None:
             pipe.send((sent, time.process_time()))
 
 
-def _publish(taker: PictureTaker, moment: Moment, streams: dict[str, Stream]) -> None:
-    viewed = [streams[name] for name in moment.due if streams[name].has_viewers]
+def _publish(taker: PictureTaker, request: RenderRequest, streams: dict[str, Stream]) -> None:
+    viewed = [streams[name] for name in request.due if streams[name].has_viewers]
     if not viewed:
         return
-    taker.follow(moment)
-    for name in moment.due:
+    taker.follow(request)
+    for name in request.due:
         if streams[name] in viewed:
             streams[name].publish(taker.take(name))
-    if moment.held:
+    if request.held:
         for stream in viewed:
             stream.wait_until_sent()
 

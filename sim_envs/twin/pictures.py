@@ -11,7 +11,7 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
-from touchgoal.sim_envs.twin.picture_process import STATE, Fault, Moment, Scene
+from touchgoal.sim_envs.twin.picture_process import STATE, Fault, RenderRequest, Scene
 from touchgoal.sim_envs.twin.tcp_ports import Service
 
 CAMERA_RATE = 25  # Hz, as a fingertip's; more than a policy reads
@@ -68,7 +68,7 @@ class Pictures(Service):
                 return
             state = np.empty(mujoco.mj_stateSize(env.model, STATE))
             mujoco.mj_getState(env.model, env.data, state, STATE)
-            self._tell(Moment(due, state, env.pad_contacts(), self.held))
+            self._tell(RenderRequest(due, state, env.pad_contacts(), self.held))
             self._unanswered += 1
             self.taken += len(due)
 
@@ -108,7 +108,7 @@ class Pictures(Service):
         self.close()
         raise answer or UserError("the process for the twin's pictures did not start")
 
-    def _tell(self, message: Scene | Moment | Fault) -> None:
+    def _tell(self, message: Scene | RenderRequest | Fault) -> None:
         try:
             self._pipe.send(message)
         except OSError as error:

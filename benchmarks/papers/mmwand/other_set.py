@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
 from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.encoders.alignment.config import HeadsConfig
-from touchgoal.encoders.alignment.heads import Heads, Paired, fit_heads
+from touchgoal.encoders.alignment.heads import Heads, PairedEmbeddings, fit_heads
 from touchgoal.encoders.alignment.splits import split_touches
 from touchgoal.runtime.errors import UserError
 
@@ -94,7 +94,7 @@ def _fit(
     config: HeadsConfig,
     seed: int,
 ) -> Heads:
-    paired = Paired(
+    paired = PairedEmbeddings(
         touch=F.normalize(torch.from_numpy(data.touch[name][rows]), dim=1),
         label=torch.from_numpy(data.label[rows]),
         image=torch.from_numpy(data.image[rows]),

@@ -25,7 +25,7 @@ from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_retrieval
 from touchgoal.benchmarks.papers.mmwand.trained import embed_fold, read_touch_data, train
 from touchgoal.encoders.alignment.config import AlignConfig, HeadsConfig, Split
 from touchgoal.encoders.alignment.data import TouchData
-from touchgoal.encoders.alignment.heads import Paired, fit_heads
+from touchgoal.encoders.alignment.heads import PairedEmbeddings, fit_heads
 from touchgoal.encoders.alignment.retrieval import average_precisions
 from touchgoal.encoders.alignment.splits import SPLITS, Fold, split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet
@@ -102,7 +102,7 @@ def run(config: Config) -> dict[str, Any]:
 def _with_heads(data: EmbeddedSet, fold: Fold, seed: int, name: str, config: HeadsConfig) -> Found:
     """Judge an encoder with heads that are fitted on the training side."""
     touch = F.normalize(torch.from_numpy(data.touch[name]), dim=1)
-    paired = Paired(
+    paired = PairedEmbeddings(
         touch=touch[fold.train],
         label=torch.from_numpy(data.label[fold.train]),
         image=torch.from_numpy(data.image[fold.train]),

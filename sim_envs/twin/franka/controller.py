@@ -97,7 +97,7 @@ class FrankaArm(Service):
         return motion is None or not motion.begun or self._echoed >= self._sent - 1
 
     @property
-    def obeys(self) -> bool:
+    def follows_commands(self) -> bool:
         """Whether the client's motion has begun, or the arm accepts none."""
         motion = self._motion
         return self.mode != RobotMode.IDLE or (motion is not None and motion.begun)
