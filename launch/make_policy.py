@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Annotated
 
+from touchgoal.policies.config import Head
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import RARE, Count, CountOrNone, checked_dataclass
 from touchgoal.sim_envs.config import TaskName
@@ -51,6 +52,9 @@ class Config:
     """Passes over the data in each training; default: 16 for pick-place, 5 for the maze."""
     trials: CountOrNone = 24
     """Validation episodes in which every snapshot of the last training is tried; 0 takes the last."""
+    wrench: Annotated[bool, RARE] = False
+    """Maze only: the baseline, a regression on the wrenches that a small network, trained on the
+    simulator's truth, reads from the embedding; default: diffusion on the embedding itself."""
     touch: Annotated[Path | None, RARE] = None
     """For new pads: run folder of a touch encoder (the maze) or a state estimator (pick-place)."""
     learn_touch: bool = False
@@ -72,6 +76,8 @@ def main(config: Config) -> None:
 
     if config.learn_touch and (config.touch or config.task == "pick-place"):
         raise UserError("--learn-touch goes with --task bead-maze and without --touch")
+    if config.wrench and config.task == "pick-place":
+        raise UserError("--wrench is for the maze: leave it out, or add --task bead-maze")
     if config.resume and config.out is None:
         raise UserError("to go on with a run, name its folder with --out")
     steps_of = _pick_place if config.task == "pick-place" else _bead_maze
@@ -119,7 +125,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
     deployed = [*_NO_IMAGES, *_DEPLOYED]
     run = config.touch or SHIPPED_POLICIES["pick-place"]
     learn = shlex.split(
-        "--task pick-place --head regression --representation base_twist --position-noise 0 "
+        "--task pick-place --representation base_twist --position-noise 0 "
         "--arm-state commanded --observation-horizon 4 "
         f"--train.lr 1e-3 --train.epochs {config.epochs or 16} --train.snapshot-epochs 16"
     )
@@ -133,24 +139,30 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
         steps.append(_record(out / "train", disturbed, seed, [*feedback, *pushed], config))
     # The third round is in the plain environment, where nothing is late or estimated.
     envs = [deployed, deployed, _NO_IMAGES, deployed, deployed]
-    return steps + _corrected(config, out, learn, envs, config.corrections or 200)
+    return steps + _corrected(config, out, learn, "regression", envs, config.corrections or 200)
 
 
 def _bead_maze(config: Config, out: Path) -> list[list[str]]:
-    """Return the steps: regression of the expert that knows the wire, corrected likewise."""
+    """Return the steps: diffusion of the expert that knows the wire, corrected likewise.
+
+    The policies of the rounds are regressions, which learn in an eighth of the time; the recorded
+    corrections are the expert's all the same.
+    """
     touch = out / "touch" if config.learn_touch else config.touch
     learn = shlex.split(  # Observing two ticks it led the bead less often on validation wires.
         "--representation body_twist --arm-state commanded --train.lr 1e-3 --env.start-angle 10 "
-        "--task bead-maze --head regression --observation-horizon 4 "
+        "--task bead-maze --observation-horizon 4 "
         f"--train.snapshot-epochs 5 --train.epochs {config.epochs or 5}"
     )
+    learn += ["--touch-input", "wrench" if config.wrench else "embedding"]
     learn += ["--encoder", str(touch / "encoder") if touch else _MAZE_TOUCH]
+    head = "regression" if config.wrench else "small"
     deployed, many = [*_MAZE, *_DEPLOYED], config.demonstrations or 160
     steps = _demonstrations(config, out, many, many, [*_VALIDATION, *_DEPLOYED], deployed)
     if config.learn_touch:
         options = shlex.split("--frames 45 --mae.bottleneck --mae.epochs 12 --out")
         steps.append(["train-encoder", "mae", *_data(out), *options, str(out / "touch")])
-    return steps + _corrected(config, out, learn, [deployed] * 3, config.corrections or 80)
+    return steps + _corrected(config, out, learn, head, [deployed] * 3, config.corrections or 80)
 
 
 def _demonstrations(
@@ -166,9 +178,14 @@ def _demonstrations(
 
 
 def _corrected(
-    config: Config, out: Path, options: list[str], envs: list[list[str]], episodes: int
+    config: Config,
+    out: Path,
+    options: list[str],
+    head: Head,
+    envs: list[list[str]],
+    episodes: int,
 ) -> list[list[str]]:
-    """Return rounds of training and correction (DAgger), and the last training."""
+    """Return rounds of training and correction (DAgger), and the last training, of `head`."""
     from touchgoal.runtime.errors import UserError
 
     rounds = len(envs) if config.rounds is None else config.rounds
@@ -178,11 +195,11 @@ def _corrected(
     steps = []
     for k, env in enumerate(envs[:rounds]):
         folder = out / f"round-{k + 1}"
-        steps.append([*learn, "--trials", "0", "--out", str(folder)])
+        steps.append([*learn, "--head", "regression", "--trials", "0", "--out", str(folder)])
         seed = seeds.CORRECTIONS[k].first(episodes, "--corrections")
         acts = ["--policy", str(folder / "policy"), *env]
         steps.append(_record(out / "train", episodes, seed, acts, config))
-    final = [*learn, "--trials", str(config.trials), "--env.as-deployed"]
+    final = [*learn, "--head", head, "--trials", str(config.trials), "--env.as-deployed"]
     return [*steps, [*final, "--out", str(out / "policy")]]
 
 

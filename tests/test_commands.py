@@ -200,9 +200,10 @@ def test_learning_the_bead_maze(
     assert "safety.indentation" in capsys.readouterr().out
     run("benchmark", "policy-delay", "--policy", "expert", "--episodes", 1, "--delay", 0, "--jitter", 0, "--rates",
         30, "--workers", 1, "--out", "delay")  # fmt: skip
-    run("benchmark", "robustness", "--policy", "expert", "--tasks", "pick-place", "--light", 0.1,
-        "--episodes", 1, "--workers", 1)  # fmt: skip
-    assert "pick-place, light +10 %" in capsys.readouterr().out
+    run("benchmark", "robustness", "--policy", "expert", "--tasks", "pick-place",
+        "--changes", "light +10%", "2 ticks late", "--episodes", 1, "--workers", 1)  # fmt: skip
+    printed = capsys.readouterr().out
+    assert "pick-place, light +10%" in printed and "pick-place, 2 ticks late" in printed
     run("benchmark", "policy-latency", "--policy", "policy/policy", "--repeats", 3,
         "--large-repeats", 0)  # fmt: skip
     assert "denoising" in capsys.readouterr().out
