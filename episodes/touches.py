@@ -49,7 +49,7 @@ def collect_touches(
 ) -> Touches:
     """Draw frames with and without contact from both fingertips of every episode.
 
-    Contact is the simulator's if the set has it, else `detect_contact`'s. The background is the
+    Contact is the simulator's if the set has it, else a `ContactDetector`'s. The background is the
     median of a side's first 5 frames. The view is the wrist image 5 frames before the last one
     without contact on either side (the first, if that is earlier or there is no contact), when the
     hand does not yet hide the object. An episode with fewer frames of a kind gives all it has.

@@ -56,11 +56,6 @@ class AuditRow:
     low: float  # 95 % interval of replaced - real
     high: float
 
-    @property
-    def differs(self) -> bool:
-        """Whether the interval of the difference excludes 0."""
-        return self.low > 0 or self.high < 0
-
 
 @dataclass(frozen=True)
 class AuditTable:

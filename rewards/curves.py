@@ -189,8 +189,3 @@ class ContactSearch:
         streams = [self._streams.setdefault(key, ContactStream()) for key in sides]
         pairs = zip(streams, sides, strict=True)
         return np.stack([stream.update(chunk.frames[key]) for stream, key in pairs], axis=1)
-
-
-def first_contact(episode: Episode) -> Contact:
-    """Return the first contact of a whole episode, see `ContactSearch`."""
-    return ContactSearch().update(episode)

@@ -137,14 +137,6 @@ def test_however_quick_the_machine_a_plan_is_done_from_the_tick_after_its_observ
     threaded.close()
 
 
-def test_a_failing_planner_stops_the_actor() -> None:
-    config = replace(TOY, touch_dim=0, touch="")
-    actor = RealTimeActor(LearnedPolicy(toy_policy(config, toy_dataset(config)).eval(), None))
-    with pytest.raises(KeyError):
-        actor.act({})
-    actor.close()
-
-
 def test_a_planner_that_fails_later_is_not_waited_for() -> None:
     config = replace(TOY, touch_dim=0, touch="", execution_horizon=1)
     planner = LearnedPolicy(toy_policy(config, toy_dataset(config)).eval(), None)

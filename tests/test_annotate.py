@@ -314,21 +314,3 @@ def test_bad_input_is_one_line(
         assert message in told, told
         assert "Traceback" not in told
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_align_trains_on_annotations(annotated: tuple, tmp_path: Path) -> None:
-    text = (annotated[0] / "annotations.jsonl").read_text().splitlines()
-    (tmp_path / "a.jsonl").write_text("\n".join(text[:7]))
-    (tmp_path / "b.jsonl").write_text("\n".join(text[7:]))
-    options = ["--data", str(tmp_path / "a.jsonl"), "--validation", str(tmp_path / "b.jsonl")]
-    options += [
-        "--sensor",
-        "gelsight_markers",
-        "--align.backbone",
-        "vit-tiny",
-        "--align.epochs",
-        "1",
-    ]
-    main(["train-encoder", "align", *options, "--out", str(tmp_path / "run")])
-    assert (tmp_path / "run" / "encoder").is_dir()

@@ -62,9 +62,10 @@ def test_the_verdict_is_yes_where_touch_tells_and_no_where_it_was_shuffled() -> 
     assert "another episode's touch ends" in audit.verdict and "farther away" in audit.verdict
     rows = {(r.metric, r.replacement): r for r in audit.rows}
     assert len(rows) == 4 * len(REPLACEMENTS)
-    assert rows["last cost", "neutral"].low > 0.3 and rows["lag", "shifted"].differs
+    assert rows["last cost", "neutral"].low > 0.3 and rows["lag", "shifted"].low > 0
     assert rows["AUC", "neutral"].high < -0.1
-    assert not rows["last cost", "mirrored"].differs  # both fingertips feel the same here
+    same = rows["last cost", "mirrored"]  # both fingertips feel the same here
+    assert same.low <= 0 <= same.high
     told_nothing = [shuffled(e) for e in told]
     audit = audit_touch(told_nothing, goals, measure)
     assert not audit.mattered and "no sign that touch mattered" in audit.table

@@ -8,9 +8,8 @@ import pytest
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.safety.limits import TASK_FORCES
-from touchgoal.control.tactile.contact import detect_contact
+from touchgoal.control.tactile.contact import THRESHOLD, contact_strength
 from touchgoal.episodes.recording import run
-from touchgoal.policies.evaluation.evaluate import run_trials, trial_specs
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze, add_bead_on_wire, add_wire
 from touchgoal.sim_envs.config import BeadMazeConfig
@@ -148,8 +147,8 @@ def test_the_hand_closes_while_a_fixture_holds_the_bead(maze: BeadMaze) -> None:
     assert not info[ft.TRUTH_CONTACT].any()
     ticks = list(run(env, BeadMazeExpert(env), observation, info))
     for key in ft.TACTILE:
-        assert not detect_contact(ticks[0][key][None], untouched[key]).any()
-        assert detect_contact(np.stack([ticks[12][key]]), untouched[key]).all()
+        before, after = contact_strength(np.stack([ticks[0][key], ticks[12][key]]), untouched[key])
+        assert before < THRESHOLD < after
     np.testing.assert_array_equal(ticks[0][ft.STATE][:7].round(3), ticks[9][ft.STATE][:7].round(3))
     assert ticks[30][ft.TRUTH_PROGRESS] > 0 and not ticks[30][ft.TRUTH_FAILURE].any()
 
@@ -178,13 +177,6 @@ def test_bead_stays_on_the_wire_whatever_the_hand_does(maze: BeadMaze) -> None:
         point, _ = maze.wire.at(maze.wire.project(maze.object_pose()[:3], maze.arc_length))
         assert np.linalg.norm(maze.object_pose()[:3] - point) < 2e-3
     assert pressed
-
-
-def test_trials_depend_on_wire_and_seed_alone() -> None:
-    jobs = trial_specs(replace(BLIND, split="validation"), 2, seed=7)
-    both = list(run_trials(BLIND, BeadMazeExpert, jobs, workers=2))
-    assert both[1:] == list(run_trials(BLIND, BeadMazeExpert, jobs[1:], workers=1))
-    assert [t.episode["family"] for t in both] == ["fourier", "roller"] and both[0].failure == ""
 
 
 def test_bad_requests_say_what_to_do(maze: BeadMaze) -> None:

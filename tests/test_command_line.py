@@ -281,11 +281,6 @@ def test_an_unfit_surrounding_is_one_line(tmp_path: Path, shell: str, message: s
     assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("touchgoal ")
 
 
-def test_closed_streams_are_no_mistake(tmp_path: Path) -> None:
-    line = f"{sys.executable} -m touchgoal.launch list objects <&- >&-"
-    assert subprocess.run(["bash", "-c", line], capture_output=True).stderr == b""
-
-
 def test_a_full_disk_is_one_line_with_the_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -98,22 +98,6 @@ def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
     assert json.loads((out / "metrics.json").read_text())[0]["source"] == "episodes#0"
 
 
-def test_reward_curves_of_a_video_and_of_a_folder(episodes: Path, tmp_path: Path) -> None:
-    video = next(episodes.rglob("observation.images.front/**/*.mp4"))
-    run("reward-curves", video, "--out", tmp_path / "video")
-    frames, _ = read_frames(video)
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    for i, frame in enumerate(frames):
-        cv2.imwrite(str(folder / f"{i}.png"), np.ascontiguousarray(frame[..., ::-1]))
-    run("reward-curves", folder, "--out", tmp_path / "folder")
-    one, other = (
-        np.loadtxt(next((tmp_path / name).glob("*.csv")), delimiter=",", skiprows=1, usecols=2)
-        for name in ("video", "folder")
-    )
-    np.testing.assert_allclose(one, other, atol=1e-3)
-
-
 @pytest.mark.slow
 def test_train_encoder_then_use_it(episodes: Path, validation: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
@@ -327,18 +311,6 @@ def test_mistakes_leave_nothing(
     without_towers = refused(capsys, *curves, "--goal", "text:hard and smooth")
     assert "is missing: pip install -e '" in without_towers and "[towers]'" in without_towers
     assert not out.exists()
-
-
-def test_wrong_encoder_for_the_sensor(
-    episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    other = tmp_path / "encoder"
-    shutil.copytree(pretrained.DEFAULT_ENCODER, other)
-    text = (other / "encoder.json").read_text()
-    (other / "encoder.json").write_text(text.replace("gelsight_mini", "digit"))
-    out = tmp_path / "out"
-    message = refused(capsys, "reward-curves", episodes, "--encoder", other, "--out", out)
-    assert "is for digit, not gelsight_mini" in message and not out.exists()
 
 
 def test_wrong_data_for_an_encoder(

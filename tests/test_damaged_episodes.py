@@ -2,20 +2,14 @@
 
 import json
 import os
-import random
 import shutil
-import signal
 import struct
-import subprocess
-import sys
-import time
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import toy_episodes
 from toy_episodes import FPS, PNG_START, assert_holds, flip_byte, make_episode, record
 
 from touchgoal.control import features as ft
@@ -240,30 +234,3 @@ def test_killed_in_the_first_episode(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "no whole episode" in repair(tmp_path)[-1]
     record(tmp_path, range(2))
     assert validate(tmp_path) == []
-
-
-RECORDER = """
-import runpy, sys
-from touchgoal.episodes.store import EpisodeWriter
-make_episode = runpy.run_path(sys.argv[1])["make_episode"]
-writer = EpisodeWriter(sys.argv[2])
-while True:
-    print(writer.append(make_episode(len(writer))), flush=True)
-"""
-
-
-def test_killed_recorder_loses_no_acknowledged_episode(tmp_path: Path) -> None:
-    rng, acknowledged = random.Random(0), -1
-    for _ in range(3):
-        command = [sys.executable, "-c", RECORDER, toy_episodes.__file__, str(tmp_path)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as recorder:
-            assert recorder.stdout is not None
-            for _ in range(rng.randint(1, 5)):
-                acknowledged = int(recorder.stdout.readline())
-            time.sleep(rng.uniform(0, 0.05))
-            recorder.send_signal(signal.SIGKILL)
-            acknowledged = int((recorder.stdout.read().split() or [acknowledged])[-1])
-        repair(tmp_path)
-        assert validate(tmp_path) == []
-        assert len(EpisodeSet(tmp_path)) - 1 in (acknowledged, acknowledged + 1)
-    assert_holds(tmp_path, list(range(len(EpisodeSet(tmp_path)))))

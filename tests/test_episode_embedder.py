@@ -18,7 +18,6 @@ from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBack
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.rewards.curves import Contact, first_contact
 from touchgoal.rewards.distance.embedding_distance import compute_curves, compute_distances
 from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
 from touchgoal.rewards.goals import (
@@ -100,17 +99,6 @@ def test_curves_are_causal(embedder: EpisodeEmbedder) -> None:
         assert long.potential_rewards()[name][:9] == pytest.approx(reward, abs=1e-6)
 
 
-def test_contact_is_the_simulators_or_detected() -> None:
-    episode = recorded()
-    assert first_contact(episode) == Contact(7, "truth")
-    without_truth = {k: v for k, v in episode.frames.items() if k != TRUTH_CONTACT}
-    assert first_contact(replace(episode, frames=without_truth)) == Contact(7, "detected")
-    assert (
-        first_contact(replace(episode, frames={FRONT: without_truth[FRONT]})).label_source
-        == "no touch"
-    )
-
-
 def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:
     e = embedder.embed_episode(recorded(), 20.0, "mine", descriptions=True)
     assert e.modalities == ALL and (e.object, e.success) == ("apple", True)
@@ -155,19 +143,6 @@ def test_goals_from_a_picture_and_from_another_episode(
         GoalPicture(tmp_path / "end.png").read()
     with pytest.raises(UserError, match="does not exist"):
         GoalPicture(tmp_path / "none.png").read()
-
-
-def test_video_has_pictures_alone(embedder: EpisodeEmbedder) -> None:
-    frames = recorded().frames[FRONT]
-    episode = embedder.embed_episode(recorded(), 20.0, "mine")
-    for any_embedder in (embedder, EpisodeEmbedder(PaintTowers(), None)):
-        video = any_embedder.embed_episode(Episode({FRONT: frames}, "video"), 30.0, "a.mp4")
-        goal = choose([OwnFrame()], video.modalities)
-        curves = compute_curves(video, any_embedder.embed_goal(goal, video), None)
-        assert list(curves.costs) == ["image"] and curves.contact.frame is None
-        of_episode = compute_curves(episode, embedder.embed_goal(goal, episode), None)
-        assert curves.costs["image"] == pytest.approx(of_episode.costs["image"])
-        assert curves.costs["image"][0] > 0.01
 
 
 def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:

@@ -46,36 +46,6 @@ def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> N
     assert np.allclose(*backbone.embed_frames(frames, frames[0]))  # the same touch, twice
 
 
-def sliding(count: int, seed: int) -> TouchFrames:
-    """Contacts that have moved, each with the frame before; the "force" along x is the motion."""
-    rng = np.random.default_rng(seed)
-    y, x = np.mgrid[:120, :160]
-    place, motion = rng.uniform((40, 50), (80, 110), (count, 2)), rng.uniform(-12, 12, count)
-
-    def blobs_at(columns: np.ndarray) -> np.ndarray:
-        distance2 = (y - place[:, :1, None]) ** 2 + (x - columns[:, None, None]) ** 2
-        return 3 * np.exp(-distance2 / 15**2)
-
-    frames = np.stack([blobs_at(place[:, 1]), blobs_at(place[:, 1] - motion)], 1)
-    touch = torch.from_numpy(np.repeat(frames[:, :, None], 3, 2)).half()
-    wrench = np.column_stack([motion / 10, place / 100, np.zeros((count, 3))])
-    return TouchFrames(touch, torch.from_numpy(wrench).float(), SENSOR, stride=2)
-
-
-def test_two_frames_on_top_of_each_other_tell_motion(tmp_path: Path) -> None:
-    train, val = sliding(256, 0), sliding(64, 1)
-    config = replace(TOY, stacked=True, epochs=8, mask_ratio=0.25)
-    backbone = train_unlabelled(train, val, config, tmp_path, TrainerOptions(), {"data": "toy"})
-    metrics = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")["metrics"]
-    assert metrics["force_x_r2"] > 0.5
-    assert backbone.offsets == (0, 2) and backbone.config.vit.channels == 6
-    newest_alone = replace(train, touch=train.touch[:, 0]), replace(val, touch=val.touch[:, 0])
-    single = replace(config, stacked=False)
-    train_unlabelled(*newest_alone, single, tmp_path / "single", TrainerOptions(), {})
-    blind = pretrained.ENCODER_FORMAT.provenance(tmp_path / "single/encoder")["metrics"]
-    assert blind["force_x_r2"] < 0.1
-
-
 def test_the_paper_preset_is_table_2() -> None:
     paper = MAE_PRESETS["paper"]
     assert (paper.lr, paper.batch_size, paper.epochs) == (1e-4, 100, 150)

@@ -12,7 +12,7 @@ from touchgoal.control import features as ft
 from touchgoal.encoders.training.run import open_training
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.episodes.media import read_frames
-from touchgoal.episodes.recording import EpisodeSpec, collect, episode_specs
+from touchgoal.episodes.recording import EpisodeSpec, episode_specs
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch import train_policy
@@ -245,13 +245,6 @@ def test_ctrl_c_keeps_what_is_recorded_and_says_how_to_go_on(
     episodes = EpisodeSet(tmp_path / "episodes")
     assert [episodes.meta(i)["seed"] for i in range(len(episodes))] == [0, 1]
     assert episodes.meta(0)["task"] == "pick-place"
-
-
-def test_a_ur5e_is_recorded(tmp_path: Path) -> None:
-    env = PickPlaceConfig(arm="ur5e", cameras=(), tactile=False, max_seconds=0.2)
-    collect(tmp_path / "set", env, [EpisodeSpec(1)], workers=1)
-    frames = EpisodeSet(tmp_path / "set").read(0).frames
-    assert frames[ft.ACTION].shape == (5, 7) and frames[ft.STATE].shape == (5, 13)
 
 
 def test_only_what_is_known_to_be_good_is_learned_from(tmp_path: Path) -> None:

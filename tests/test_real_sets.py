@@ -1,7 +1,6 @@
 """Published sets of real touch in small: their readers, and the tables made from them."""
 
 import csv
-import json
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,6 @@ from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
     read_objectfolder_real,
     read_touches,
 )
-from touchgoal.episodes.importers.touch_sets.tvl import read_tvl
 from touchgoal.episodes.importers.touch_sets.vt60 import (
     inside_dome,
     is_vt60,
@@ -138,25 +136,3 @@ def test_objectfolder_real(tmp_path: Path) -> None:
     assert "the most frequent material" in result["table"] and "0.67" in result["table"]
     with pytest.raises(UserError, match="has no words"):
         zero_shot.run(zero_shot.Config(data=tmp_path, encoders=("gelsight_mini_markers_mae",)))
-
-
-def test_tvl(tmp_path: Path) -> None:
-    ssvtp, hct = tmp_path / "ssvtp", tmp_path / "hct" / "data1"
-    write_table(ssvtp / "train.csv", ("url",), ("images_rgb/image_7_rgb.jpg",))
-    for name in ("images_rgb/image_7_rgb.jpg", "images_tac/image_7_tac.jpg"):
-        write_picture(ssvtp / name, np.zeros((8, 8, 3)))
-    (ssvtp / "text").mkdir()
-    (ssvtp / "text" / "labels_7.txt").write_text("Smooth, hard.\n")
-    header = ("url", "tactile", "tactile_background", "caption")
-    own = ("vision/3/1.jpg", "tactile/3/1.jpg", "tactile/3/bg.jpg", "rough, soft")
-    write_table(hct / "train.csv", header, own)
-    (hct / "contact.json").write_text(json.dumps({}))
-    for name in (*own[:2], "digit_background.png"):
-        write_picture(hct / name, np.zeros((8, 8, 3)))
-    one, other = read_tvl(tmp_path, "train")
-    assert one.words == ("smooth", "hard") and one.untouched is None
-    assert one.touch == ssvtp / "images_tac" / "image_7_tac.jpg"
-    assert other.words == ("rough", "soft") and other.press == "hct/data1/tactile/3"
-    assert other.untouched == hct / "digit_background.png"  # where a press has none of its own
-    with pytest.raises(UserError, match=r"no test\.csv"):
-        read_tvl(tmp_path, "test")

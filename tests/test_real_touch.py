@@ -61,13 +61,6 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_videos_are_read_with_their_labels(clips: Path) -> None:
-    videos = read_labelled_videos(clips)
-    assert len(videos) == 18 and videos[3].object == "thing1"
-    assert videos[3].ranks == (1, 0, 1) and videos[-1].ranks is None
-    assert videos[0].frames().shape == (9, 60, 80, 3)
-
-
 def test_the_benchmark_judges_encoders(clips: Path) -> None:
     result = run(Config(data=clips, encoders=("pixels", "random:gelsight_mini")))
     row = result["rows"][0]

@@ -14,7 +14,6 @@ from safetensors.torch import save_file
 from sparsh_files import published
 from test_episode_embedder import PaintTowers, recorded
 
-import touchgoal
 from touchgoal.control.cell.cell_file import EXAMPLES, read_cell_file
 from touchgoal.control.features import (
     FRONT,
@@ -122,13 +121,6 @@ def test_a_mistake_is_one_line(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(UserError, match=message) as error:
         call()
     assert "\n" not in str(error.value)
-
-
-def test_shipped_encoder_by_name() -> None:
-    pytest.importorskip("transformers")
-    curves = touchgoal.reward_curve(IMAGES, TOUCH, ("last", "a hard smooth round object"))
-    assert curves.costs.keys() == {"image", "tactile", "text"}
-    assert curves.costs["tactile"][0] > 0.1
 
 
 # ---- sources

@@ -10,7 +10,7 @@ from test_episode_embedder import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, WRIST
 from touchgoal.control.tactile.sensor_models import SENSORS
-from touchgoal.rewards.curves import Contact, potential_reward
+from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, fit_units
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
@@ -133,13 +133,6 @@ def test_pieces_of_a_trajectory_cost_the_same_as_the_whole(
         parts = compute_curves(tick, goal, normalizer, value, before).parts
         before = {name: float(cost[-1]) for name, cost in parts.items()}
         assert before == pytest.approx({name: cost[t] for name, cost in whole.items()}, abs=1e-6)
-
-
-def test_holding_still_pays_nothing() -> None:
-    hold = np.full(200, 0.7)
-    assert np.abs(potential_reward(hold, 1.0)).max() == 0
-    reaching = np.concatenate([np.linspace(1, 0.7, 20), hold])
-    assert potential_reward(reaching, 1.0).sum() == pytest.approx(0.3)
 
 
 def test_distances_by_hand() -> None:

@@ -261,18 +261,6 @@ def test_rewards_by_hand() -> None:
     assert potential_reward(cost, 0.9) == pytest.approx([0.0, 0.64, -0.14, 0.6])
 
 
-@pytest.mark.parametrize("gamma", [0.5, 0.99, 1.0])
-def test_potential_rewards_leave_the_best_policy(gamma: float) -> None:
-    """Their discounted sum depends on where a path begins and ends alone (Ng et al. 1999)."""
-    rng = np.random.default_rng(0)
-    first, last = 0.9, 0.1
-    for _ in range(5):
-        path = np.concatenate([[first], rng.random(20), [last]])
-        shaping = potential_reward(path, gamma)[1:]
-        total = shaping @ gamma ** np.arange(len(shaping))
-        assert total == pytest.approx(first - gamma ** len(shaping) * last)
-
-
 def test_a_cost_nearer_than_the_usual_end_is_below_zero() -> None:
     raw = {"image": np.array([1e-16 - 2e-16, 2.0]), "tactile": np.array([0.1, 0.3])}
     near = {"image": np.array([-0.4, 1.0]), "tactile": np.array([1.0, -0.2])}

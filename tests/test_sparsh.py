@@ -42,23 +42,6 @@ def test_the_published_models_have_the_published_number_of_parameters(
     assert sum(parameter.numel() for parameter in vit.parameters()) == parameters
 
 
-def test_registers_are_seen_by_attention_and_left_out_of_the_output() -> None:
-    vit = ViT(replace(TOY, registers=3, layer_scale=1.0, class_token=True))
-    images = torch.randn(2, 3, 32, 48)
-    before = vit(images)
-    assert before.shape == (2, 1 + 6, 48)
-    assert vit.registers is not None
-    with torch.no_grad():
-        vit.registers[:, 2] += 1
-    assert not torch.allclose(vit(images), before)
-
-
-def test_a_block_whose_branches_are_scaled_by_nothing_does_nothing() -> None:
-    vit = ViT(replace(TOY, layer_scale=0.0))
-    images = torch.randn(2, 3, 32, 48)
-    torch.testing.assert_close(vit(images), vit.norm(vit.embed_patches(images)))
-
-
 def test_clips_of_any_size_become_tubelets_time_by_time() -> None:
     vit = ViT(replace(TOY, tubelet=2, frames=4))
     clip = torch.randn(1, 3, 4, 32, 40)  # padded to 48
@@ -283,17 +266,6 @@ def test_ids_of_hugging_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     save_file(published(), folder / "snapshots" / commit / "mae_vitsmall.safetensors")
     with pytest.raises(UserError, match=r"mae_vitsmall.safetensors, mae_vittiny.safetensors: give"):
         load_encoder("facebook/sparsh-mae-toy")
-
-
-def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path) -> None:
-    save_file({"conv1.weight": torch.zeros(3)}, tmp_path / "model.safetensors")
-    with pytest.raises(UserError, match="but conv1.weight") as refusal:
-        load_encoder(tmp_path / "model.safetensors")
-    assert "\n" not in str(refusal.value)
-    with pytest.raises(UserError, match="no such file"):
-        load_encoder(tmp_path / "lost.ckpt")
-    with pytest.raises(UserError, match="there is no touch encoder"):
-        load_encoder("facebook/dino")
 
 
 def test_real_touch_takes_them(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBack
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import save
-from touchgoal.encoders.probes.attentive import AttentivePooler, AttentiveProbe
+from touchgoal.encoders.probes.attentive import AttentivePooler
 from touchgoal.encoders.ssl.frames import sample_frames
 from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.episodes.store import EpisodeSet
@@ -77,25 +77,6 @@ def test_the_pad_slips_where_the_rig_slides() -> None:
         assert field.wrench()[:3] == pytest.approx([pull, 0, -2.0], abs=1e-3)
 
 
-def test_shear_shows_on_a_gel_without_dots_and_only_there() -> None:
-    pictures = {}
-    for relief in (False, True):
-        bench = PressBench(
-            Body(CATALOGUE["glass_ball"], (4e-3,), 0.1), GELSIGHT_MINI, rig_unit(RIG), relief
-        )
-        bench.place(np.zeros(3))
-        for pull in (0.0, 1.5):
-            sensed = bench.sense(3.0, np.random.default_rng(0), (pull, 0.0), depth=-1.5e-4)
-            pictures[relief, pull] = sensed.image.astype(int), 1e6 * sensed.surface
-    assert np.array_equal(pictures[True, 0.0][0], pictures[False, 0.0][0])
-    added = pictures[True, 1.5][1] - pictures[False, 1.5][1]
-    half = added.shape[1] // 2
-    assert (
-        added[:, :half].max() > 5 and added[:, half:].min() < -5
-    )  # um: sunk behind, piled up in front
-    assert np.abs(pictures[True, 1.5][0] - pictures[False, 1.5][0]).max() >= 4
-
-
 def test_a_stroke_is_untouched_pressed_and_drawn_the_same_each_time() -> None:
     stroke, again = simulate(RIG, 4), simulate(RIG, 4)
     assert np.array_equal(stroke.frames, again.frames) and stroke.indenter == "sharp"
@@ -135,29 +116,6 @@ def test_the_pooler_is_attention_as_torch_has_it() -> None:
     pooled = pooler.query[0] + pooler.proj(seen)
     wanted = pooled + pooler.mlp_out(torch.nn.functional.gelu(pooler.mlp_in(pooler.norm2(pooled))))
     torch.testing.assert_close(pooler(tokens), wanted)
-
-
-def test_a_probe_finds_the_one_token_that_matters() -> None:
-    """No linear reading of the mean can: the token's place is random, its marker says which."""
-    torch.manual_seed(0)
-    probe, generator = AttentiveProbe(features=6, outputs=1, width=32, heads=2), torch.Generator()
-    optimizer = torch.optim.Adam(probe.parameters(), lr=3e-3)
-
-    def batch(n: int) -> tuple[torch.Tensor, torch.Tensor]:
-        tokens = torch.randn(n, 12, 6, generator=generator)
-        marked = torch.randint(12, (n,), generator=generator)
-        tokens[:, :, 0] = -2.0
-        tokens[torch.arange(n), marked, 0] = 2.0
-        return tokens, tokens[torch.arange(n), marked, 1]
-
-    for _ in range(400):
-        tokens, wanted = batch(64)
-        loss = (probe(tokens)[:, 0] - wanted).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    tokens, wanted = batch(512)
-    assert (probe(tokens)[:, 0] - wanted).square().mean() < 0.3  # of the mean token: 11/12
 
 
 def test_a_slide_pulls_at_the_gel_up_to_the_cone() -> None:

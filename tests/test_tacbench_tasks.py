@@ -8,7 +8,6 @@ import pytest
 import torch
 from published_files import gel, write_force_batch, write_grasps, write_pose_set
 
-from touchgoal.benchmarks.papers.tacbench import published_recordings
 from touchgoal.benchmarks.papers.tacbench.benchmark import run
 from touchgoal.benchmarks.papers.tacbench.config import Config
 from touchgoal.benchmarks.papers.tacbench.data import read_cloths, read_grasps
@@ -201,21 +200,6 @@ def test_bags_become_classes_of_their_motions(tmp_path: Path) -> None:
     bags = np.unique(frames.stroke[task.split.tests["known objects"].numpy()])
     assert bags.tolist() == list(range(10, 20))  # the published test bags
     assert np.unique(frames.stroke[task.split.validation.numpy()]).tolist() == [4, 9]
-
-
-def test_of_a_long_recording_the_middle_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(published_recordings, "_LONGEST", 12)
-    write_pose_set(tmp_path, bags=1, pictures=18, shape=(32, 24))
-    published = find_published(tmp_path, "digit")
-    assert published is not None
-    frames = published.read(4, DIGIT)
-    assert len(frames.touch) == 4 * 12 and frames.pose is not None
-    motion = (frames.pose - frames.pose[frames.before]).numpy()
-    for i, bag in enumerate(read_bags(tmp_path)):
-        expected = bag.change[8:15] * (1e3, 1e3, 180 / np.pi)
-        assert np.allclose(motion[12 * i + 5 : 12 * i + 12], expected, atol=1e-3)
 
 
 def test_grasps_are_pairs_of_moments(tmp_path: Path) -> None:

@@ -2,13 +2,11 @@
 
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 import pytest
 
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as MINI
-from touchgoal.sim_envs.scene import build as scene
-from touchgoal.sim_envs.scene.contacts import ContactReader, PadContact
+from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.tactile.forces import ForceField, force_field
 from touchgoal.sim_envs.tactile.geometry import NO_SURFACE, Grid
 from touchgoal.sim_envs.tactile.markers import (
@@ -173,84 +171,6 @@ def test_spin_turns_the_traction_about_the_contact() -> None:
     # More than 8/15 of mu N a, the patch's all: everything slips, and the sum is still right.
     spun = feel(ball(*at), wrench(6.0, at, torsion=20e-3))
     assert spun.slip_fraction >= GROSS and spun.wrench()[5] == pytest.approx(20e-3, rel=0.01)
-
-
-class Slider:
-    """A ball on slide joints that presses with a given force on a gel plate and is moved over it."""
-
-    radius = 0.02
-
-    def __init__(self, normal: float) -> None:
-        spec = mujoco.MjSpec()
-        scene.set_options(spec, scene.SceneConfig())
-        spec.option.gravity = np.zeros(3)
-        hand = spec.worldbody.add_body(name="base").add_body(name="hand")
-        hand.add_site(name="tcp")
-        x, y, out = np.array([0.0, 0, 1]), np.array([-1.0, 0, 0]), np.array([0, -1.0, 0])
-        for side, away in (("left", 0.0), ("right", 1.0)):
-            finger = hand.add_body(name=f"{side}_finger", pos=[away, 0, 0])
-            finger.add_site(name=f"{side}_sensor", quat=scene._quaternion(x, y, out))
-            scene._add_gel(spec, finger, side, MINI, 0.0)
-        body = spec.worldbody.add_body(name="object", pos=[0, -self.radius, 0])
-        for name, axis in (("along", x), ("across", y), ("out", out)):
-            body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis.tolist())
-        body.add_geom(
-            name="object",
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=[self.radius, 0, 0],
-            mass=0.1,
-            priority=1,
-            condim=6,
-            friction=[FRICTION, 0.005, 0.0005],
-            solref=[0.004, 1],
-            solimp=[0.95, 0.99, 0.001, 0.5, 2],
-        )
-        gains = {"gainprm": [1e5] + [0] * 9, "biasprm": [0, -1e5, -1e3] + [0] * 7}
-        for name in ("along", "across"):
-            motor = spec.add_actuator(name=name, target=name, **gains)
-            motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
-            motor.gaintype = mujoco.mjtGain.mjGAIN_FIXED
-            motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-        self.model, self.normal = spec.compile(), normal
-        self.data = mujoco.MjData(self.model)
-        self._reader = ContactReader(self.model)
-        self.move(0.0, 500)
-
-    def move(self, speed: float, steps: int) -> PadContact:
-        """Move at a speed (m/s) for some ms; the pad's contact after that."""
-        data, out = self.data, self.data.joint("out")
-        for _ in range(steps):
-            data.actuator("along").ctrl += speed * self.model.opt.timestep
-            out.qfrc_applied = -self.normal - 5 * out.qvel
-            mujoco.mj_step(self.model, data)
-        (contact, _), _ = self._reader.read(data)
-        return contact
-
-    def height(self) -> np.ndarray:
-        site = self.data.site("left_sensor")
-        x, y, z = site.xmat.reshape(3, 3).T @ (self.data.geom("object").xpos - site.xpos)
-        return ball(x, y, self.radius) + np.float32(self.radius - z)
-
-
-@pytest.mark.parametrize("normal", [1.0, 5.0])
-def test_incipient_slip_leads_gross_slip(normal: float) -> None:
-    slider, field = Slider(normal), None
-    incipient, gross, solver = [], [], []
-    for _ in range(400):
-        contact = slider.move(1e-3, 2)
-        press = press_until_balanced(slider.height(), GRID.pitch, contact, 3e8, MINI)
-        field = force_field(press, field, contact, FRICTION, MINI)
-        found = field.wrench()
-        scale = np.linalg.norm(contact.force)
-        assert np.linalg.norm(found[:3] - contact.force) < 0.01 * scale
-        assert np.linalg.norm(found[3:] - contact.torque) < 0.01 * 5e-3 * scale
-        incipient.append(field.slip_fraction >= INCIPIENT)
-        gross.append(field.slip_fraction >= GROSS)
-        solver.append(contact.slip_speed > 5e-4)
-    first = [2 * flags.index(True) for flags in (incipient, gross, solver)]  # ms
-    assert first[1] - first[0] >= 20
-    assert abs(first[1] - first[2]) <= 6
-    assert all(incipient[first[0] // 2 :]) and all(gross[first[1] // 2 :])  # they do not flicker
 
 
 @pytest.mark.parametrize("k", [50.0, 250.0, 1500.0])

@@ -116,20 +116,6 @@ def test_image_embedding_does_not_depend_on_the_batch(
     torch.testing.assert_close(repeated, together.repeat(3, 1), rtol=1e-4, atol=1e-4)
 
 
-def test_text_tower_knows_what_words_mean(offline: OfflineTowers) -> None:
-    goal, near, far = offline.embed_texts(
-        ["a smooth hard ball", "a round firm sphere", "a rough woven cloth"]
-    )
-    assert goal.shape == (384,)
-    assert F.cosine_similarity(goal, near, dim=0) > F.cosine_similarity(goal, far, dim=0) + 0.1
-
-
-def test_text_embedding_does_not_depend_on_padding(offline: OfflineTowers) -> None:
-    texts = ["soft", "a hard and heavy bar with fine ribs along all of its length"]
-    alone = torch.cat([offline.embed_texts([text]) for text in texts])
-    torch.testing.assert_close(offline.embed_texts(texts), alone, rtol=1e-4, atol=1e-5)
-
-
 def test_other_weights_in_the_wheel_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,10 +1,7 @@
 """Moves and the tracker at 1 kHz: inside every limit, at rest at both ends, straight where they say so."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import ruckig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -29,18 +26,6 @@ ROBOTS = [
     (robots.FR3, Fr3Kinematics()),
     (robots.UR5E, Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)),
 ]
-
-
-def ruckig_duration(start: np.ndarray, goal: np.ndarray, limits: JointLimits) -> float:
-    """Seconds of the fastest move from rest to rest; each joint goes its own way in between."""
-    wanted, found = ruckig.InputParameter(start.size), ruckig.Trajectory(start.size)
-    wanted.current_position, wanted.target_position = start.tolist(), goal.tolist()
-    wanted.max_velocity = limits.velocity.tolist()
-    wanted.max_acceleration = limits.acceleration.tolist()
-    wanted.max_jerk = limits.jerk.tolist()
-    if ruckig.Ruckig(start.size).calculate(wanted, found) != ruckig.Result.Working:
-        raise AssertionError("ruckig found no move")
-    return found.duration
 
 
 def peak_shares(trajectory: Trajectory, limits: JointLimits) -> np.ndarray:
@@ -73,22 +58,6 @@ def test_full_speed_joint_moves_use_a_limit_up_and_exceed_none(
         assert (shares <= 1).all() and shares.max() > 0.97
         np.testing.assert_allclose(move.at(0.0), q, atol=1e-12)
         np.testing.assert_allclose(move.at(move.duration), goal, atol=1e-12)
-        q = goal
-
-
-@pytest.mark.parametrize(("robot", "arm"), ROBOTS, ids=["FR3", "UR5e"])
-@pytest.mark.parametrize("speed", ["interface", "policy"])
-def test_moves_take_little_longer_than_the_fastest(
-    robot: RobotLimits, arm: Kinematics, speed: str
-) -> None:
-    """Ruckig, to which constant limits can be told, lets each joint go its own way in between."""
-    limits, rng = replace(getattr(robot, speed), taper=None), np.random.default_rng(0)
-    q = arm.arm.home
-    for k in range(60):
-        goal = rng.uniform(limits.lower, limits.upper)
-        if k % 3 == 0:  # short ones as well
-            goal = np.clip(q + rng.uniform(-0.3, 0.3, q.size), limits.lower, limits.upper)
-        assert joint_move(q, goal, limits).duration < 1.15 * ruckig_duration(q, goal, limits)
         q = goal
 
 

@@ -55,27 +55,6 @@ def test_compiled_arm_agrees_with_mujoco(arm: Literal["fr3", "ur5e"]) -> None:
             np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-12)
 
 
-def test_the_estimate_of_force_errs_as_a_real_arms_and_repeats() -> None:
-    """Of an arm at rest in free air: wrong by newtons, and the same again for the same seed."""
-
-    def felt(wrench_error: bool, seed: int) -> np.ndarray:
-        env = PickPlace(PickPlaceConfig(cameras=(), tactile=False))
-        cell = SimulatedCell(env, seed, wrench_error)
-        wrenches = []
-        for _ in range(100):
-            cell.step()
-            wrenches.append(cell.env.external_wrench() + cell.wrench_error)
-        return np.array(wrenches)
-
-    seeds = [felt(True, seed) for seed in range(6)]
-    np.testing.assert_array_equal(felt(True, 0), seeds[0])
-    assert np.abs(felt(False, 0)[-1]).max() < 0.05
-    off = np.array([wrenches.mean(0) for wrenches in seeds])
-    assert 0.3 < off[:, :3].std() < 2 and np.abs(off[:, :3]).max() < 4
-    noise = np.array([np.diff(wrenches[:, :3], axis=0).std() for wrenches in seeds])
-    assert (noise > 0.1).all() and (noise < 0.3).all()
-
-
 def test_fixture_waits_for_the_first_grasp() -> None:
     maze = BeadMazeConfig(split="validation", n_wires=20, tactile=False)
     cell = SimulatedCell(BeadMaze(maze), 3)

@@ -110,43 +110,6 @@ def test_ur_refuses_what_it_does_not_simulate_and_goes_on(ur5e: RunningTwin) -> 
     ur5e.begin("reset 3")  # which clears the protective stop
 
 
-def sends_urscript(address: str) -> dict:
-    """Sends a script of its own."""
-    from rtde_control import RTDEControlInterface
-    from rtde_receive import RTDEReceiveInterface
-
-    receive, control = RTDEReceiveInterface(address), RTDEControlInterface(address)
-    q = np.array(receive.getActualQ())
-    said: dict[str, Any] = {"raised": ""}
-    try:
-        control.sendCustomScriptFunction("wave", f"movej({(q + 0.1).tolist()})")
-    except RuntimeError as error:
-        said["raised"] = str(error)
-    said["stopped"] = receive.isProtectiveStopped()
-    said["moved"] = float(np.abs(np.array(receive.getActualQ()) - q).max())
-    return said
-
-
-def goes_on(address: str) -> dict:
-    """Moves, after whatever came before."""
-    from rtde_control import RTDEControlInterface
-    from rtde_receive import RTDEReceiveInterface
-
-    receive, control = RTDEReceiveInterface(address), RTDEControlInterface(address)
-    goal = np.array(receive.getActualQ()) + 0.05
-    taken = control.moveJ(goal.tolist(), 1.0, 1.0)
-    return {"taken": taken, "off": float(np.abs(np.array(receive.getActualQ()) - goal).max())}
-
-
-def test_ur_runs_no_urscript_and_the_call_ends(ur5e: RunningTwin) -> None:
-    said = client(sends_urscript, ur5e.cell.address)
-    assert "Failed to start control script" in said["raised"]
-    assert said["stopped"] and said["moved"] < 2e-3
-    ur5e.begin("reset 3")  # which clears the protective stop
-    said = client(goes_on, ur5e.cell.address)
-    assert said["taken"] and said["off"] < 2e-3
-
-
 def protected(address: str, reset: str) -> dict:
     """Servoes into a protective stop, unlocks it after 5 s, and goes on; then connects anew."""
     import socket

@@ -226,18 +226,3 @@ def test_a_policy_feels_what_its_training_did(vit: ViTConfig, real_time: bool) -
     assert len(felt) >= 6 and max(known[key] for key in felt) > 2 * STRIDE
     for key, rows in felt.items():
         np.testing.assert_allclose(rows, recorded[known[key]], atol=1e-5)
-
-
-def test_no_frame_is_preprocessed_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    touch, ticks = TouchEmbedder(backbone(CLIP), "toy"), toy_observations(12)
-    made, preprocess = [], touch._recent[ft.TACTILE_LEFT]._preprocess
-
-    def counted(frames, background):
-        made.append(frames)
-        return preprocess(frames, background)
-
-    for recent in touch._recent.values():
-        monkeypatch.setattr(recent, "_preprocess", counted)
-    for i in range(len(ticks)):
-        touch.embed_tick(ticks[max(i - touch.reach, 0) : i + 1], ticks[0])
-    assert len(made) == 2 * len(ticks)

@@ -78,8 +78,7 @@ class RealTimeActor(Actor):
         self._planner, self._config = planner, planner.config
         # s from an observation to its plan, without the first plan
         self.latencies: list[float] = []
-        # plans that were late; ticks without any plan
-        self.late_plans = self.ticks_without_plan = 0
+        self.ticks_without_plan = 0
         self._lag = lag
         self._before: np.ndarray | None = None  # joints (rad) wanted at the last tick
         self.failure: BaseException | None = None  # ended the planning thread; `act` raises it
@@ -135,7 +134,6 @@ class RealTimeActor(Actor):
             self._history = [*self._history[1:], observation]
             if self._request:  # the requested plan is due at this tick
                 self._condition.wait_for(self._no_request, self._timeout)
-                self.late_plans += self._request is not None
             if self._request is None and self._due():
                 self._request = _Request(self._tick, self._history, time.monotonic())
             self._condition.notify_all()

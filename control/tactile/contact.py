@@ -1,7 +1,7 @@
 """Contact of a fingertip, from its pictures alone."""
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from touchgoal.control.arrays import Picture, Pictures
 from touchgoal.control.tactile.background import Background, local_change
@@ -80,15 +80,3 @@ def threshold_for(untouched: Pictures, background: Picture) -> float:
     Compressed streams have a strength of 1 to 2. Fewer than half of the frames may be in contact.
     """
     return max(THRESHOLD, _SPARE * float(np.median(contact_strength(untouched, background))))
-
-
-def detect_contact(
-    frames: Pictures, background: Picture, threshold: float | int = THRESHOLD
-) -> Bool[np.ndarray, " n"]:
-    """Run a `ContactDetector` over a recording and return whether each frame is in contact.
-
-    `background` is the same sensor untouched, such as the median of the first frames; `threshold`
-    in counts.
-    """
-    detector = ContactDetector(Background(background[None]), threshold)
-    return np.array([detector.update(frame) for frame in frames], bool)

@@ -28,7 +28,6 @@ STAGES = (  # kernel, stride of the first block, expansion, output channels, rep
 )
 MAP_BLOCK = 10
 """Last block at stride 16, whose features still say where in the image something is."""
-MAP_CHANNELS = 112
 _BATCH_NORM_EPS = 1e-3  # TensorFlow's default, under which the weights were trained
 
 

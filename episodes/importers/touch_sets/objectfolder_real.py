@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from touchgoal.episodes.importers.touch_clip import read_picture_file
-from touchgoal.episodes.importers.touch_sets.tables import check_there, has_columns, read_table
+from touchgoal.episodes.importers.touch_sets.tables import check_there, read_table
 from touchgoal.runtime.errors import UserError
 
 _COLUMNS = ("index", "name", "material")
@@ -25,11 +25,6 @@ class TouchedObject:
     material: str | None  # in lower case; None where not labelled
     touch: Path
     picture: Path | None
-
-
-def is_objectfolder_real(folder: Path) -> bool:
-    """Return whether a folder holds the table and the touches of such a set."""
-    return (folder / "touch").is_dir() and has_columns(folder / "objects.csv", _COLUMNS)
 
 
 def read_objectfolder_real(folder: Path) -> list[TouchedObject]:
