@@ -96,8 +96,8 @@ def find_encoder(name_or_path: str | Path, published: bool = True) -> Path:
     if Path(name).is_dir():
         raise UserError(f"no touch encoder in {name}: {ENCODER_FORMAT.remedy}")
     raise UserError(
-        f"there is no touch encoder '{name}': give its folder, or the name of a shipped one: "
-        f"{', '.join(encoder_names())}"
+        f"there is no touch encoder '{name}': give its folder (touchgoal pull makes one from the Hub), or "
+        f"the name of a shipped one: {', '.join(encoder_names())}"
     )
 
 

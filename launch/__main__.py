@@ -37,6 +37,8 @@ COMMANDS = {
     "calibrate": "fit a sensor's light and gel to presses of a ball",
     "deploy": "run a policy on an arm or on the twin, with safety and recording",
     "twin": "serve the simulated cell over the wire protocols of real ones",
+    "push": "upload an encoder or a policy to the Hugging Face Hub",
+    "pull": "download one from the Hugging Face Hub and check it",
     "repair": "check a set of episodes and mend what an interruption left",
     "benchmark": "print one table of measured figures",
     "completion": "print a script that completes commands and options in a shell",

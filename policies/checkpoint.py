@@ -134,7 +134,7 @@ def suggestion(name: str, names: tuple[str, ...] = tuple(SHIPPED_POLICIES)) -> s
     """Return the end of a message about an unknown policy: the nearest name, and what there is."""
     close = get_close_matches(name, names, 1)
     guess = f"did you mean {close[0]}? " if close else ""
-    return f"{guess}choose from {', '.join(names)}, or name a folder that train-policy made"
+    return f"{guess}choose from {', '.join(names)}, or name a folder that train-policy or pull made"
 
 
 def _config(fields: dict[str, Any]) -> PolicyConfig:

@@ -16,6 +16,8 @@ CountOrNone = Annotated[int, Field(ge=0)]
 """Count that may be 0."""
 Seed = Annotated[int, Field(ge=0)]
 Port = Annotated[int, Field(ge=0, le=65535)]
+Repository = Annotated[str, Field(pattern=r"^\w[\w.-]*/\w[\w.-]*$")]
+"""Repository on the Hugging Face Hub, as owner/name."""
 
 Point = tuple[float, float]
 """x and y in an image, px; the centre of its first pixel is (0, 0)."""

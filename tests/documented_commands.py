@@ -45,6 +45,8 @@ NOT_RUN = {
     "check-sensor": "needs a sensor and a person: test_own_sensor.py",
     "calibrate": "needs presses of a real sensor: test_calibration.py",
     "train-encoder adapt": "needs videos: test_real_touch.py",
+    "push": "needs a hub: test_hub.py",
+    "pull": "needs a hub: test_hub.py",
     "teleop": "needs a terminal and a person: test_teleop.py",
     "benchmark": "test_commands.py runs each at toy size",
     "make-policy": "test_commands.py",

@@ -1,0 +1,154 @@
+"""Encoders and policies by way of a model hub: huggingface_hub's own client, over the wire."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hub_server import TOKEN, HubServer, running_hub
+from huggingface_hub import HfApi, constants
+
+from touchgoal.encoders.hub.repository import pulled, push
+from touchgoal.encoders.pretrained import find_encoder, load_encoder
+from touchgoal.launch.pull import load_pulled
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES, find_policy
+from touchgoal.runtime.errors import UserError
+
+ENCODER = find_encoder("gelsight_mini_surfaces")
+POLICY = SHIPPED_POLICIES["pick-place"]
+
+
+@pytest.fixture
+def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
+    monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)  # a protocol of the real hub's own
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)  # conftest.py's, for all other tests
+    monkeypatch.setattr(constants, "HF_TOKEN_PATH", "/nonexistent")
+    with running_hub() as server:
+        yield server
+
+
+def api(hub: HubServer, token: str | None = TOKEN) -> HfApi:
+    return HfApi(hub.url, token=token)
+
+
+def files(folder: Path) -> dict[str, Any]:
+    """Content of each file, that of JSON read."""
+    return {
+        path.relative_to(folder).as_posix(): json.loads(path.read_bytes())
+        if path.suffix == ".json"
+        else path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def refusal(hub: HubServer, tmp_path: Path, name: str = "lab/model", token: str = TOKEN) -> str:
+    with (
+        pytest.raises(UserError) as refused,
+        pulled(name, tmp_path, api(hub, token)) as (folder, k),
+    ):
+        load_pulled(folder, k, name)
+    assert "\n" not in str(refused.value) and list(tmp_path.iterdir()) == []
+    return str(refused.value)
+
+
+def test_the_commands_push_and_pull_an_encoder(hub: HubServer, tmp_path: Path) -> None:
+    """As a person types them; a folder pulled by name is found by that name."""
+    environment = {**os.environ, "HF_ENDPOINT": hub.url, "HF_TOKEN": TOKEN}
+    environment |= {
+        "HF_HUB_DISABLE_XET": "1",
+        "HF_HUB_OFFLINE": "0",
+        "HF_HOME": str(tmp_path / "home"),
+    }
+    for arguments in (["push", str(ENCODER), "lab/surfaces"], ["pull", "lab/surfaces"]):
+        command = [sys.executable, "-m", "touchgoal.launch", *arguments]
+        done = subprocess.run(
+            command, env=environment, cwd=tmp_path, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+    there = hub.repositories["lab/surfaces"]
+    assert {"config.json", "model.safetensors", "value.safetensors", "README.md"} <= set(there)
+    card = there["README.md"].decode()
+    assert "library_name: touchgoal" in card and "train-encoder words" in card
+    found = files(tmp_path / "lab" / "surfaces")
+    assert found.pop("README.md") == card.encode() and found == files(ENCODER)
+    images = np.random.default_rng(0).integers(0, 256, (1, 240, 320, 3), dtype=np.uint8)
+    ours, shipped = (load_encoder(f).embed(images) for f in (tmp_path / "lab/surfaces", ENCODER))
+    np.testing.assert_array_equal(ours, shipped)
+
+
+def test_a_policy_keeps_its_parts_and_a_later_push_what_it_holds(
+    hub: HubServer, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(POLICY, run / "policy")
+    (run / "policy" / "README.md").write_text("my own card")
+    (run / "policy" / "notes.txt").write_text("not data")
+    push(run, "lab/picker", True, api(hub))
+    assert hub.private == {"lab/picker"}
+    assert hub.repositories["lab/picker"]["README.md"] == b"my own card"
+    with pulled("lab/picker", tmp_path, api(hub)) as (folder, kind):
+        load_pulled(folder, kind, "lab/picker")
+        assert kind == "policy" and find_policy(folder) == folder
+        assert files(folder) == {**files(POLICY), "README.md": b"my own card"}
+    (run / "policy" / "recipe.json").unlink()
+    push(run, "lab/picker", True, api(hub))
+    assert "recipe.json" not in hub.repositories["lab/picker"]
+    assert ".gitattributes" in hub.repositories["lab/picker"]  # none of our files
+
+
+def test_every_refusal_is_one_line(
+    hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("HF_TOKEN", raising=False)
+    with pytest.raises(UserError, match="there is no token for http://127.* hf auth login"):
+        push(ENCODER, "lab/model", False, api(hub, None))
+    with pytest.raises(UserError, match="refuses access to lab/model: use a token that may write"):
+        push(ENCODER, "lab/model", False, api(hub, "hf_wrong"))
+    with pytest.raises(UserError, match="no encoder or policy in"):
+        push(tmp_path, "lab/model", False, api(hub))
+    with pytest.raises(UserError, match="'lab/a--b' is no name of a repository"):
+        push(ENCODER, "lab/a--b", False, api(hub))
+    assert "has no model lab/model that you may read" in refusal(hub, tmp_path)
+    push(ENCODER, "lab/hidden", True, api(hub))
+    assert "private" in refusal(hub, tmp_path, "lab/hidden", "hf_wrong")
+    with (
+        pytest.raises(UserError, match="^cannot reach http://127.0.0.1:9 .*: check the network"),
+        pulled("lab/model", tmp_path, HfApi("http://127.0.0.1:9")),
+    ):
+        pass
+
+
+def test_other_peoples_files_are_refused_and_no_code_is_downloaded(
+    hub: HubServer, tmp_path: Path
+) -> None:
+    push(ENCODER, "lab/model", False, api(hub))
+    sound = dict(hub.repositories["lab/model"])
+    description = json.loads(sound["config.json"])
+    other = json.dumps(description | {"model_type": "bert"}).encode()
+    odd = json.loads(sound["config.json"])
+    odd["config"]["kind"] = "teapot"
+    for changes, message in (
+        ({"config.json": other}, "holds no encoder or policy that touchgoal push made"),
+        ({"config.json": b"[]"}, "holds no encoder or policy that touchgoal push made"),
+        ({"config.json": json.dumps(odd).encode()}, "damaged"),
+        ({"config.json": b"{"}, "lab/model: config.json is damaged or no json"),
+        ({"value.json": b"\xff"}, "lab/model: value.json is damaged or no json"),
+        (
+            {"model.safetensors": b"\x80\x04pickle"},
+            "model.safetensors is damaged or no safetensors",
+        ),
+        ({"model.safetensors": sound["value.safetensors"]}, "does not fit its encoder.json"),
+    ):
+        hub.repositories["lab/model"] = sound | changes
+        assert message in refusal(hub, tmp_path), changes
+    code = {"modeling.py": b"1/0", "a.pt": b"", "../evil.json": b"{}", "a/b/c.json": b"{}"}
+    hub.repositories["lab/model"] = sound | code
+    with pulled("lab/model", tmp_path, api(hub)) as (folder, _):
+        assert set(files(folder)) == {*files(ENCODER), "README.md"}
