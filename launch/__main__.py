@@ -36,6 +36,7 @@ COMMANDS = {
     "check-sensor": "try a sensor on your own frames: noise, drift, contact, depth, force, markers",
     "calibrate": "fit a sensor's light and gel to presses of a ball",
     "deploy": "run a policy on an arm or on the twin, with safety and recording",
+    "arm": "move an arm home, open or close its hand, recover it after a fault",
     "twin": "serve the simulated cell over the wire protocols of real ones",
     "push": "upload an encoder or a policy to the Hugging Face Hub",
     "pull": "download one from the Hugging Face Hub and check it",

@@ -133,6 +133,7 @@ def _deploy(
     from touchgoal.control.safety.action_filter import ActionFilter
     from touchgoal.episodes.schema import Episode
     from touchgoal.episodes.store import EpisodeWriter
+    from touchgoal.launch.support.confirm import confirm
 
     def writer() -> EpisodeWriter:
         return EpisodeWriter(episodes, ft.CONTROL_HZ)
@@ -149,7 +150,7 @@ def _deploy(
     print("\n".join(map(str, results)), flush=True)
     require_all_ok(results)
     if config.execute and not config.yes:
-        _confirm(cell)
+        confirm(cell)
     terminal = Terminal()
     session = Session(
         cell=cell,
@@ -166,16 +167,6 @@ def _deploy(
     with terminal.watching():
         print(f"{'MOVING' if config.execute else 'dry run'}: {HELP}", flush=True)
         return session.run()
-
-
-def _confirm(cell: "CellConfig") -> None:
-    """UserError unless the operator types which arm is to move."""
-    name = f"{cell.arm} {cell.address}".strip()
-    if sys.stdin is None or not sys.stdin.isatty():
-        raise UserError("nobody is there to confirm: run it in a terminal, or add --yes")
-    print(f"The arm will move. One hand on its stop, nobody in reach? Type: {name}")
-    if input("> ").strip() != name:
-        raise UserError("not confirmed; nothing has moved")
 
 
 def _report(result: "Result", out: Path) -> None:

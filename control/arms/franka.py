@@ -91,9 +91,9 @@ class FrankaClient(ArmClient):
     def _fault(self, state: "franky.RobotState") -> str:
         mode = self._franky.RobotMode
         if state.robot_mode == mode.Reflex:
-            return f"reflex ({_errors(state)}): clear the cause, then recover the arm"
+            return f"reflex ({_errors(state)}): clear the cause, then: touchgoal arm recover"
         if state.robot_mode == mode.UserStopped:
-            return "user stop: release the activation device, then recover the arm"
+            return "user stop: release the activation device, then: touchgoal arm recover"
         if state.robot_mode not in (mode.Idle, mode.Move):
             return f"the arm is in mode {state.robot_mode.name}: set it to execution in Desk"
         return f"{self._aborted}; recover the arm" if self._aborted else ""

@@ -171,12 +171,16 @@ class ArmProcess:
     """Arm over an ArmClient in a child process."""
 
     def __init__(
-        self, client: type[ArmClient], config: ArmConfig, connect_timeout: float = 30.0
+        self,
+        client: type[ArmClient],
+        config: ArmConfig,
+        recover: bool = False,
+        connect_timeout: float = 30.0,
     ) -> None:
         self._make = lambda recover: DriverProcess(
             client, config, recover, connect_timeout=connect_timeout
         )
-        self._process = self._make(False)
+        self._process = self._make(recover)
         self._last: ArmReading = self._process.call("read")
 
     def read(self) -> ArmReading:

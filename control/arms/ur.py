@@ -83,9 +83,7 @@ class UrClient(ArmClient):
         if self._receive.isEmergencyStopped():
             return "emergency stop: release it and restart the arm at the pendant, then recover"
         if self._receive.isProtectiveStopped():
-            return (
-                "protective stop: clear the cause, wait 5 s, then recover or unlock at the pendant"
-            )
+            return "protective stop: clear the cause, wait 5 s, then: touchgoal arm recover"
         return ""
 
     def _fault(self) -> str:

@@ -122,9 +122,10 @@ class CellConnection:
                     stack.callback(device.close)
 
 
-def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
+def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellConnection:
     """Connect to everything in a cell with a real arm or a twin; commands will come at `hz`.
 
+    A lock-step twin begins the episode of `task.seed`, or goes on with its own if not `new_episode`.
     UserError or DriverError if a device is missing; the connected ones are released.
     """
     robot = cell_limits(cell)
@@ -145,11 +146,14 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
                 cameras[key] = keep(_tactile_camera(cell, cell.fingertips, side))
         load_cell = keep(SerialLoadCell(cell.load_cell)) if cell.load_cell else None
         gripper = keep(_gripper(cell))
-        arm = keep(_arm(cell, robot, hz))
+        arm = keep(connect_arm(cell, hz))
         clock: Clock = RealClock()
         if cell.lock_step and isinstance(gripper, FrankaHand):
             clock = LockStepClock(cell.task.twin, arm, gripper, cameras, load_cell)
-            clock.reset(cell.task.seed)
+            if new_episode:
+                clock.reset(cell.task.seed)
+            else:
+                clock.go_on()
         elif cell.lock_step:
             clock = ArmClock(arm)
         undo.pop_all()
@@ -157,13 +161,17 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
     return CellConnection(robot, arm, gripper, cameras, load_cell, clock, truth)
 
 
-def _arm(cell: CellConfig, robot: RobotLimits, hz: float) -> ArmProcess:
+def connect_arm(cell: CellConfig, hz: float, recover: bool = False) -> ArmProcess:
+    """Connect to a cell's arm alone; `recover` clears a fault first: only when a person asked for it.
+
+    DriverError if the arm is missing or lets nobody connect.
+    """
     ur5e = cell.arm == "ur5e"
     rate, timeout = (ur.RATE, ur.STATE_TIMEOUT) if ur5e else (franka.RATE, franka.STATE_TIMEOUT)
     timeout = cell.safety.state_timeout or timeout
     lock_step = cell.lock_step and not ur5e
-    config = ArmConfig(cell.address, robot, hz, rate, timeout, lock_step)
-    return ArmProcess(ur.UrClient if ur5e else franka.FrankaClient, config)
+    config = ArmConfig(cell.address, cell_limits(cell), hz, rate, timeout, lock_step)
+    return ArmProcess(ur.UrClient if ur5e else franka.FrankaClient, config, recover)
 
 
 def _gripper(cell: CellConfig) -> Gripper:

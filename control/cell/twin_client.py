@@ -96,6 +96,10 @@ class LockStepClock:
         self._history.append((time.monotonic(), 0.0))
         self._arm.advance(0.0)  # the driver now follows this time, not libfranka's
 
+    def go_on(self) -> None:
+        """Let the arm's driver follow the twin's time from where it is."""
+        self._arm.advance(self._time)
+
     def now(self) -> float:
         """See Clock."""
         return self._time

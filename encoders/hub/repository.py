@@ -139,7 +139,7 @@ def _rename_as_on_disk(folder: Path, repository: str) -> Kind:
     """Give the main pair the names that `WeightsFormat` reads; return the kind of model."""
     description = json.loads((folder / CONFIG).read_text())
     model_type = description.pop(_MODEL_TYPE, None) if isinstance(description, dict) else None
-    kinds = [kind for kind in KINDS if model_type == f"touchgoal_{kind}"]
+    kinds: list[Kind] = [kind for kind in KINDS if model_type == f"touchgoal_{kind}"]
     if not kinds:
         raise _not_ours(repository)
     [kind] = kinds

@@ -1,0 +1,98 @@
+"""Move an arm or its hand without a task, or recover the arm after a reflex or a stop.
+
+`home` moves slowly to the cell file's task.start, by default to the arm's home; `open` lets go of what the
+hand holds. Speed, workspace, force and torque are limited as in `deploy`; cameras and fingertips are
+not read, so gels are not watched. Exit status: 0 done, 1 nothing moved, 4 the arm was stopped.
+"""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import checked_dataclass
+
+if TYPE_CHECKING:
+    from touchgoal.control.cell.config import CellConfig
+    from touchgoal.control.deployment.manual import Move
+
+_STOPPED = 4  # exit status
+
+
+@checked_dataclass
+class Config:
+    """Options of arm."""
+
+    action: Annotated[Literal["home", "open", "close", "recover"], tyro.conf.Positional]
+    """Move the arm home, open or close the hand, or clear a fault whose cause is gone."""
+    cell: Annotated[Path, tyro.conf.Positional]
+    """Cell file of an arm, or the cell.json of a twin."""
+    yes: bool = False
+    """Do not ask for the typed confirmation (for tests)."""
+
+
+def main(config: Config) -> None:
+    """Connect, ask, act, report."""
+    from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
+    from touchgoal.control.deployment.manual import arm_and_gripper
+    from touchgoal.control.deployment.preflight import check_client
+    from touchgoal.control.interfaces import DriverError
+    from touchgoal.launch.support.confirm import confirm
+
+    cell = arm_and_gripper(read_cell_file(find_cell_file(config.cell)))
+    if cell.arm == "sim":
+        raise UserError(
+            "a simulated arm ends with its command: give a real arm's cell file or a twin's"
+        )
+    check_client(cell)
+    if not config.yes:
+        confirm(cell)
+    try:
+        if config.action == "recover":
+            _recover(cell)
+        else:
+            _move(config.action, cell)
+    except DriverError as error:
+        raise UserError(str(error)) from error
+
+
+def _recover(cell: "CellConfig") -> None:
+    from contextlib import closing
+
+    from touchgoal.control import features as ft
+    from touchgoal.control.cell.connection import connect_arm
+
+    with closing(connect_arm(cell, ft.CONTROL_HZ, recover=True)) as arm:
+        if fault := arm.read().fault:
+            raise UserError(f"not recovered: {fault}")
+    print("recovered: the arm takes commands")
+
+
+def _move(move: "Move", cell: "CellConfig") -> None:
+    from contextlib import closing
+
+    import numpy as np
+
+    from touchgoal.control import features as ft
+    from touchgoal.control.cell.connection import connect_cell
+    from touchgoal.control.deployment.control_loop import PLAN_ENDED
+    from touchgoal.control.deployment.manual import run_move
+    from touchgoal.control.deployment.terminal import HELP, Terminal
+
+    terminal = Terminal()
+    with closing(connect_cell(cell, ft.CONTROL_HZ, new_episode=False)) as connection:
+        with terminal.watching():
+            print(f"MOVING: {HELP}", flush=True)
+            ending = run_move(move, cell, connection, terminal.operator_request, terminal.show_tick)
+        arm, hand = connection.arm.read(), connection.gripper.read()
+    holds = ", it holds something" if hand.grasped else ""
+    print(
+        f"joints at {np.round(arm.q, 3).tolist()} rad, hand {1e3 * hand.width:.0f} mm wide{holds}"
+    )
+    if ending.stopped:
+        print(f"touchgoal arm: {ending}", file=sys.stderr)
+        sys.exit(_STOPPED)
+    if ending.reason != PLAN_ENDED:
+        raise UserError(f"{move} was not finished: {ending}")
