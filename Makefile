@@ -27,7 +27,7 @@ test: $(READY)
 # our driver on controllers that are not ours (franka-sim, which wants an older mujoco, and franky-sim).
 interop: $(READY)
 	$(PYTHON) -m venv .venv-interop
-	.venv-interop/bin/pip install -q numpy pylibfranka franky-control ur_rtde franky-sim==1.0.4 "mujoco<3.3" trimesh
+	.venv-interop/bin/pip install -q numpy pylibfranka franky-sim==1.0.4 "mujoco<3.3" trimesh
 	.venv-interop/bin/pip install -q --no-deps franka-sim==1.1.7
 	$(BIN)/python tests/interop/run.py
 

@@ -16,7 +16,7 @@ def numbered(k: int, shape: tuple[int, int] = (96, 128)) -> np.ndarray:
     return image
 
 
-def until(holds: Callable[[], bool], seconds: float = 8.0) -> None:
+def until(holds: Callable[[], bool], seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end, "it does not happen"

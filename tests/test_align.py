@@ -19,7 +19,7 @@ from touchgoal.encoders.alignment.data import (
     prepare_touch_data,
     split_by_episode,
 )
-from touchgoal.encoders.alignment.retrieval import evaluate_retrieval, mean_average_precision
+from touchgoal.encoders.alignment.retrieval import evaluate_retrieval, mean_average_precision, top1
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as PRESETS_VIT
 from touchgoal.encoders.training.batch_noise import BatchNoise
@@ -105,10 +105,6 @@ def make_touches(per_episode: int, seed: int, per_object: int = 1) -> Touches:
 
 
 TRAIN, VAL = make_touches(12, 0), make_touches(6, 1, per_object=4)
-
-
-def weights(encoder: TouchEncoder) -> torch.Tensor:
-    return torch.cat([w.flatten() for w in encoder.state_dict().values()])
 
 
 def final_weights(out_dir: Path) -> torch.Tensor:
@@ -349,3 +345,5 @@ def test_ties_count_as_their_expectation() -> None:
     jittered = similarity + 1e-6 * rng.random((20_000, 12))
     simulated = mean_average_precision(jittered, relevant.repeat(20_000, 0))
     assert mean_average_precision(similarity, relevant) == pytest.approx(simulated, abs=3e-3)
+    label = torch.arange(3).repeat_interleave(5)
+    assert top1(torch.ones(15, 3), label) == pytest.approx(1 / 3), "a collapsed encoder"

@@ -14,7 +14,6 @@ from touchgoal.policies.perception.proprioception import network_input, tare
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench
 from touchgoal.sim_envs.config import BeadMazeConfig, DeploymentConfig, PickPlaceConfig
-from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
@@ -106,19 +105,6 @@ def test_the_tracked_arm_comes_to_rest_where_it_is_sent() -> None:
         env.step(np.append(np.zeros(7), 0.08))
     fast = 0.2 * env.robot.hardware.velocity / 20
     assert np.all(env.command - before <= 0.08 + 1e-9) and np.all(env.command - before > 0.5 * fast)
-
-
-def test_an_expert_asks_for_no_more_than_passes() -> None:
-    """Clamped joint by joint, the hand tilts; answers that mend that at once taught ever larger ones."""
-    env = PickPlace(replace(BLIND, deployment=DeploymentConfig(tracker=True)))
-    env.reset(seed=3)
-    expert, rng = FeedbackExpert(env), np.random.default_rng(0)
-    for _ in range(40):
-        answer = expert.act({})
-        assert env.max_joint_step is not None and np.all(
-            np.abs(answer[:7]) <= env.max_joint_step + 1e-9
-        )
-        env.step(np.append(rng.normal(0, 0.1, 7), 0.08))
 
 
 def test_a_hand_ends_a_move_before_it_takes_the_next() -> None:

@@ -4,11 +4,12 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numbered_pictures import until
 from running_twin import RunningTwin
 
 from touchgoal.control.arms import franka, ur
@@ -71,13 +72,6 @@ class Twin(RunningTwin):
         if gripper.kind == "franka_hand":
             return FrankaHand(gripper.address)
         return Robotiq(RobotiqConfig(gripper.port, activate=True, widths=gripper.widths))
-
-
-def until(holds: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, "it does not happen"
-        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module", params=["fr3", "ur5e"])

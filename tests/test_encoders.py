@@ -11,6 +11,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
+from test_episode_embedder import PaintTowers
 
 from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.sensor_models import SENSORS
@@ -36,22 +37,8 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-class FakeTowers:
-    name = "fake"
-    image_dim, text_dim, pretrained_together = 12, 8, False
-
-    def embed_images(self, images: np.ndarray) -> torch.Tensor:
-        return torch.tensor(images[:, :2, :2].reshape(len(images), 12).astype(np.float32))
-
-    def embed_texts(self, texts: list[str]) -> torch.Tensor:
-        return torch.stack([torch.arange(8.0) + len(text) ** 0.5 for text in texts])
-
-
-def make_encoder(pretrained_together: bool = False) -> TouchEncoder:
-    towers = FakeTowers()
-    if pretrained_together:
-        towers.pretrained_together, towers.text_dim = True, 12
-    config = TouchEncoderConfig.for_towers(PRESETS["tiny"], towers, "gelsight_mini", 16)
+def make_encoder() -> TouchEncoder:
+    config = TouchEncoderConfig.for_towers(PRESETS["tiny"], PaintTowers(), "gelsight_mini", 16)
     return TouchEncoder(config).eval()
 
 
@@ -193,7 +180,7 @@ def test_floor_is_where_free_anchors_end(grouped: bool) -> None:
 
 
 def test_embeddings_are_unit_vectors_of_one_space(rng: np.random.Generator) -> None:
-    encoder, towers = make_encoder(), FakeTowers()
+    encoder, towers = make_encoder(), PaintTowers()
     frames = rng.integers(0, 256, (70, 60, 80, 3)).astype(np.uint8)
     touch = encoder.embed_frames(frames, frames[0])
     assert touch.shape == (70, 16)
@@ -205,10 +192,8 @@ def test_embeddings_are_unit_vectors_of_one_space(rng: np.random.Generator) -> N
 
 
 def test_other_towers_are_refused() -> None:
-    other = FakeTowers()
-    other.name = "other"
-    with pytest.raises(UserError, match="trained with the towers fake, not other"):
-        make_encoder().embed_text_goal(["soft"], other)
+    with pytest.raises(UserError, match="trained with the towers paint, not other"):
+        make_encoder().embed_text_goal(["soft"], PaintTowers("other"))
 
 
 # ---- files

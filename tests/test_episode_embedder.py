@@ -84,21 +84,6 @@ def choose(specs: Sequence[GoalSpec], available: Sequence[Modality] = ALL) -> Go
     return assign_goals(specs, available)
 
 
-def test_curves_are_causal(embedder: EpisodeEmbedder) -> None:
-    """What comes later changes no value, once the 5 frames of the background are over."""
-    whole = recorded(color=160)
-    part = replace(whole, frames={k: v[:9] for k, v in whole.frames.items()})
-    goal = choose([GoalPicture(np.full((32, 32, 3), 90, np.uint8)), Sentence("soft")])
-    long, short = (
-        compute_curves(e, embedder.embed_goal(goal, e), None)
-        for e in (embedder.embed_episode(x, 20.0, "x") for x in (whole, part))
-    )
-    for name, cost in short.costs.items():
-        assert long.costs[name][:9] == pytest.approx(cost, abs=1e-6)
-        reward = short.potential_rewards()[name]
-        assert long.potential_rewards()[name][:9] == pytest.approx(reward, abs=1e-6)
-
-
 def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:
     e = embedder.embed_episode(recorded(), 20.0, "mine", descriptions=True)
     assert e.modalities == ALL and (e.object, e.success) == ("apple", True)

@@ -187,25 +187,6 @@ def test_it_gives_way_to_what_it_presses_on() -> None:
     assert max(forces) > 30 and forces[-1] < 10
 
 
-def test_it_rights_a_tilted_hand_bit_by_bit() -> None:
-    """Whoever copies it two ticks late must not swing: x(t+1) = x(t) - k x(t-2) grows above k = 0.62."""
-    env = PickPlace(BLIND)
-    env.reset(seed=JOB.seed, options=JOB.options)
-
-    def tilt() -> float:
-        return float(np.arccos(-env.kinematics.forward(env.command)[1][2, 2]))
-
-    tilted = env.kinematics.joint_change(env.command, np.array([0, 0, 0, 0.1, 0.1, 0]))
-    env.step(np.append(tilted, 0.08))
-    expert, left = FeedbackExpert(env), [tilt()]
-    for _ in range(20):
-        env.step(expert.act({}))
-        left.append(tilt())
-    assert left[0] > 0.1 and left[-1] < 0.02 * left[0]
-    shares = 1 - np.array(left[1:6]) / left[:5]
-    assert (shares > 0.15).all() and (shares < 0.31).all()
-
-
 def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:
     config = replace(
         TOY,

@@ -1,4 +1,4 @@
-"""A Franka Hand's driver and the environment that trains for it tell the hand the same."""
+"""A Franka Hand's driver and the environment that trains for it send the hand the same commands."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from touchgoal.control.grippers.franka_hand import FrankaHandClient
+from touchgoal.control.interfaces import DriverError
 from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.cell.deployed_arm import DeployedHand
 
@@ -34,7 +35,7 @@ class Franky:
     """franky's gripper over such fingers; a command has ended once they have arrived or stand still."""
 
     def __init__(self, fingers: Fingers) -> None:
-        self.fingers, self.goal, self.said = fingers, fingers.at, []
+        self.fingers, self.goal, self.commands = fingers, fingers.at, []
         self._before, self._age, self._grasps, self._ended = fingers.at, 0, False, True
         self._looks = 0
 
@@ -59,7 +60,7 @@ class Franky:
 
     def _begin(self, goal: float, grasps: bool) -> "Franky":
         self.goal, self._grasps, self._ended, self._age = goal, grasps, False, 0
-        self.said.append(("grasp" if grasps else "move", round(goal, 4)))
+        self.commands.append(("grasp" if grasps else "move", round(goal, 4)))
         return self
 
     def move_async(self, width: float, speed: float) -> "Franky":
@@ -68,15 +69,23 @@ class Franky:
     def grasp_async(self, *_: float, **__: float) -> "Franky":
         return self._begin(0.0, True)
 
+    def stop_async(self) -> "Franky":
+        return self._begin(self.fingers.at, False)
 
-def driven(monkeypatch: pytest.MonkeyPatch, wanted: list[float], between: float) -> tuple:
-    """Widths (m, every ms) that the driver makes of these, one a look, and what it told the hand."""
+
+def connected(monkeypatch: pytest.MonkeyPatch, between: float) -> tuple[FrankaHandClient, Franky]:
     hand = Franky(Fingers(between))
     monkeypatch.setattr(
         "touchgoal.control.arms.client_libraries.ClientLibrary.load",
         lambda *_: SimpleNamespace(Gripper=lambda address: hand),
     )
-    client, widths = FrankaHandClient("here", 30.0), []
+    return FrankaHandClient("here", 30.0), hand
+
+
+def driven(monkeypatch: pytest.MonkeyPatch, wanted: list[float], between: float) -> tuple:
+    """Widths (m, every ms) that the driver makes of these, one a look, and its commands to the hand."""
+    client, hand = connected(monkeypatch, between)
+    widths = []
     for width in wanted:
         client.command(width)
         hand.look()
@@ -85,7 +94,7 @@ def driven(monkeypatch: pytest.MonkeyPatch, wanted: list[float], between: float)
             hand.fingers.go(hand.goal)
             widths.append(hand.fingers.at)
     assert not client.read().fault
-    return np.array(widths), hand.said
+    return np.array(widths), hand.commands
 
 
 def simulated(wanted: list[float], between: float) -> np.ndarray:
@@ -106,7 +115,7 @@ SEQUENCES = {
     "a move meets something": [OPEN, *[0.03] * 20, 0.02, 0.02, 0.02, *[0.07] * 10],
     "a grasp goes on": [OPEN, *[0.0] * 20, *[0.01] * 5, *[0.03] * 5, *[OPEN] * 20],
 }
-TOLD = {
+COMMANDS = {
     "passes": [],
     "goes on passing": [("move", 0.04), ("move", 0.02)],
     "stays": [("move", 0.03), ("move", 0.08)],
@@ -116,10 +125,12 @@ TOLD = {
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
-def test_a_hand_is_told_so(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_driver_and_environment_send_these_commands(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     between = 0.04 if name.startswith("a ") else 0.0
-    widths, said = driven(monkeypatch, SEQUENCES[name], between)
-    assert said == TOLD[name]
+    widths, commands = driven(monkeypatch, SEQUENCES[name], between)
+    assert commands == COMMANDS[name]
     np.testing.assert_array_equal(simulated(SEQUENCES[name], between), widths)
 
 
@@ -131,6 +142,36 @@ def test_driver_and_environment_do_the_same_whatever_is_asked(
         widths = rng.choice([0.0, 0.001, 0.01, 0.03, 0.05, OPEN, 0.2], 12)
         wanted = np.repeat(widths, rng.integers(1, 12, 12)).tolist()
         between = float(rng.choice([0.0, 0.02, 0.045]))
-        expected, said = driven(monkeypatch, wanted, between)
-        assert said
+        expected, commands = driven(monkeypatch, wanted, between)
+        assert commands
         np.testing.assert_array_equal(simulated(wanted, between), expected)
+
+
+@pytest.mark.parametrize(
+    ("release_to", "commands"),
+    [
+        (None, [("move", 0.02), ("move", 0.08)]),  # stopped where it is, and no grasp
+        (0.07, [("move", 0.02), ("move", 0.08), ("move", 0.07)]),
+    ],
+)
+def test_a_stopped_hand_takes_no_more_commands_but_to_let_go(
+    release_to: float | None, commands: list, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, hand = connected(monkeypatch, between=0.04)
+    client.command(0.02)
+    for _ in range(2):  # a width that stays is sent, one that passes is not
+        client.tick()
+    client.stop(release_to)
+    hand._ended = True
+    for _ in range(3):
+        client.tick()
+    assert hand.commands == commands
+    with pytest.raises(DriverError, match="stopped"):
+        client.command(0.05)
+
+
+def test_a_hands_fault_reaches_the_reading(monkeypatch: pytest.MonkeyPatch) -> None:
+    client, _ = connected(monkeypatch, between=0.0)
+    monkeypatch.setattr(Franky, "state", None)
+    client.tick()
+    assert "AttributeError" in client.read().fault and client.read().width == OPEN

@@ -22,15 +22,7 @@ from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
 
 _TICKS = 8
-_SMALL = [
-    "--env.objects",
-    "wooden_block",
-    "--env.cameras",
-    "front",
-    "--env.camera-size",
-    "96",
-    "96",
-]
+_SMALL = "--env.objects wooden_block --env.cameras front --env.camera-size 96 96".split()
 
 
 def swing(cell: CellConfig, pause: float) -> list[np.ndarray]:
@@ -103,16 +95,7 @@ def test_a_lock_step_cell_without_a_twin_is_one_line(address: str) -> None:
 @pytest.mark.slow
 def test_benchmark_deploy_counts_what_deploy_did(tmp_path: Path) -> None:
     """From the maze's example file, without a twin; a wire is not led to its end within half a second."""
-    run = [
-        "benchmark",
-        "deploy",
-        "--tasks",
-        "bead-maze",
-        "--policies",
-        "scripted",
-        "--episodes",
-        "1",
-    ]
+    run = "benchmark deploy --tasks bead-maze --policies scripted --episodes 1".split()
     main([*run, "--arms", "in-process", "--seconds", "0.5", "--out", str(tmp_path / "run")])
     done = json.loads((tmp_path / "run" / "metrics.json").read_text())["deployments"]
     assert len(done) == 1 and done[0]["policy"] == "follower" and not done[0]["success"]

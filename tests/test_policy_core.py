@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from torch.optim.swa_utils import AveragedModel
 from toy_policies import (
     DIFFUSION,
     FLOW,
@@ -37,7 +36,7 @@ from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNet
 from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.training import train as train_module
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
-from touchgoal.policies.training.train import ema_decay, train
+from touchgoal.policies.training.train import train
 from touchgoal.policies.training.training_data import find_pauses, report_pauses
 from touchgoal.runtime.errors import UserError
 
@@ -94,22 +93,6 @@ def test_scales_round_trip_and_keep_constants() -> None:
     assert scaled.amax(0).tolist() == pytest.approx([1, 1, 0], abs=1e-3)
     torch.testing.assert_close(scale.inverse(scaled), values)
     assert (scale.inverse(scaled + torch.tensor([0, 0, 0.7]))[:, 2] == 2).all()
-
-
-def test_average_follows_its_schedule() -> None:
-    """Power schedule of diffusion_policy, in torch's AveragedModel."""
-    network = torch.nn.Linear(1, 1)
-    average = AveragedModel(network, multi_avg_fn=train_module._update_average)
-    network.weight.data += 1
-    average.update_parameters(network)
-    (mean,) = list(average.module.parameters())[:1]
-    assert torch.equal(mean, network.weight)  # nothing to remember yet
-    before = network.weight.item()
-    network.weight.data += 1
-    average.update_parameters(network)
-    expected = before + (1 - ema_decay(1))
-    assert mean.item() == pytest.approx(expected)
-    assert ema_decay(15) == pytest.approx(1 - 16**-0.75) and ema_decay(10**9) == 0.9999
 
 
 def test_windows_stay_inside_their_episode() -> None:

@@ -4,7 +4,7 @@ import io
 import os
 import pickle
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -117,8 +117,6 @@ def test_an_encoder_learns_from_a_published_folder(
     assert recipe["data"]["train"] == [{"path": data.name, "recordings": 8, "held_out": 2}]
     for words, message in (
         (["--data", str(data), "--sensor", "gelsight_mini"], "with digit, not gelsight_mini"),
-        (["--data", str(tmp_path / "none")], "is no folder"),
-        (["--data", str(tmp_path)], "none of the published layouts"),
         (["--data", str(data), "--validation", str(data)], "leave --validation out"),
     ):
         with pytest.raises(SystemExit) as refused:
@@ -235,22 +233,13 @@ def test_a_batch_that_is_not_whole_is_one_line(tmp_path: Path) -> None:
         (lambda v: v.pop("trajectories"), "has no 'trajectories'"),
         (lambda v: v.update(trajectories={}), "has no stroke"),
         (lambda v: v.update(in_contact=np.ones(16)), "labelled as without contact"),
-        (lambda v: v.update(in_contact=["yes"] * 16), "no plain numbers"),
         (lambda v: v["trajectories"][0].pop("forces"), "stroke 0 in .* has no 'forces'"),
         (lambda v: v["trajectories"][0].update(forces=np.full((6, 3), np.nan)), "not all between"),
-        (
-            lambda v: v["trajectories"][0].update(forces=np.full((6, 3), 1e9)),
-            "between -100 and 100",
-        ),
         (
             lambda v: v["trajectories"][0].update(forces=np.zeros((6, 2))),
             r"shape \(6, 2\), not \(n, 3",
         ),
         (lambda v: v["trajectories"][0].update(forces=[[1.0], [1.0, 2.0]]), "no plain numbers"),
-        (
-            lambda v: v["trajectories"][0].update(indexes=np.arange(16, 22)),
-            "whole numbers from 0 to 15",
-        ),
         (lambda v: v["trajectories"][0].update(indexes=np.arange(3)), "3 images, 6 forces"),
         (lambda v: v["trajectories"][0].update(slip_label=np.full(6, 2)), "from 0 to 1"),
     ],
@@ -322,55 +311,41 @@ def test_grasps_are_held_or_not_and_felt_by_two_fingers(tmp_path: Path) -> None:
         next(read_grasps(tmp_path / "none"))
 
 
-def use_strokes(folder: Path) -> None:
-    for stroke in read_strokes(folder):
-        assert np.isfinite(stroke.force).all() and len(stroke.force) == len(stroke.slip)
-        assert stroke.clip.pictures[int(stroke.rows.max())]
+def write_force_labels(folder: Path) -> Path:
+    write_force_batch(folder / "sphere" / "batch_1")
+    return folder / "sphere" / "batch_1" / "dataset_slip_forces.pkl"
 
 
-def use_bags(folder: Path) -> None:
-    for bag in read_bags(folder):
-        assert np.isfinite(bag.change).all() and len(bag.change) == len(bag.clip)
+def write_bag(folder: Path) -> Path:
+    write_pose_set(folder, bags=1)
+    return folder / "train" / "sugar" / "bag_00.pkl"
 
 
-def use_all(found: Iterable[Any]) -> None:
-    for item in found:
-        assert str(item.name).encode()  # what a terminal can show
+def write_grasp_labels(folder: Path) -> Path:
+    write_grasps(folder / "000.pkl", [True, False])
+    return folder / "000.pkl"
 
 
-@pytest.mark.parametrize("layout", ["force", "pose", "grasps"])
-def test_whatever_byte_is_wrong_labels_are_read_or_refused(tmp_path: Path, layout: str) -> None:
-    if layout == "force":
-        path = tmp_path / "sphere" / "batch_1" / "dataset_slip_forces.pkl"
-        write_force_batch(path.parent)
-    elif layout == "pose":
-        path = tmp_path / "train" / "sugar" / "bag_00.pkl"
-        write_pose_set(tmp_path, bags=1)
-    else:
-        path = tmp_path / "000.pkl"
-        write_grasps(path, [True, False])
-    use = {
-        "force": use_strokes,
-        "pose": use_bags,
-        "grasps": lambda folder: use_all(read_grasps(folder)),
-    }[layout]
-    use(tmp_path)
-    data = path.read_bytes()
-    rng = np.random.default_rng(2)
+@pytest.mark.parametrize(
+    ("write_set", "read"),
+    [(write_force_labels, read_strokes), (write_bag, read_bags), (write_grasp_labels, read_grasps)],
+)
+def test_whatever_byte_is_wrong_labels_are_read_or_refused(
+    tmp_path: Path, write_set: Callable, read: Callable
+) -> None:
+    path = write_set(tmp_path)
+    assert list(read(tmp_path))
+    data, rng = path.read_bytes(), np.random.default_rng(2)
     pictures = [at for at in range(len(data)) if data[at : at + 3] == b"\xff\xd8\xff"]
-    places = rng.permutation(len(data))[:40]
-    if pictures:  # most bytes are theirs; here those about them count
-        about = [at + k for at in pictures for k in range(-12, 4)] + list(range(60))
-        tail = list(range(max(len(data) - 1500, 0), len(data)))
-        places = np.concatenate([places, rng.permutation(about + tail)[:120]])
-    else:
-        places = rng.permutation(len(data))[:150]
-    for at in places:
+    # Of a file of pictures the bytes about them and at its end count, where the labels are.
+    labels = [at + k for at in pictures for k in range(-12, 4)] + list(range(len(data)))[-1500:]
+    for at in rng.permutation(labels)[:150]:
         broken = bytearray(data)
         broken[at] ^= int(rng.integers(1, 256))
         path.write_bytes(broken)
         try:
-            use(tmp_path)
+            for item in read(tmp_path):
+                assert str(item.name).encode()  # what a terminal can show
         except UserError as refused:
             assert "\n" not in str(refused)
 
@@ -405,13 +380,10 @@ class Hostile:
     ("data", "message"),
     [
         (pickle.dumps(Hostile()), r"asks for posix\.system"),
-        (pickle.dumps(Hostile(), 2), r"asks for posix\.system"),
-        (pickle.dumps([print]), r"asks for builtins\.print"),
         (pickle.dumps(OrderedDict()), r"asks for collections\.OrderedDict"),
         (b"\x80\x03(ios\nsystem\n.", r"asks for os\.system"),
         (b"\x80\x04\x8c\x02o\n\x8c\x06system\x93.", r"asks for o\\n\.system"),
         (b"", "no pickle of plain values"),
-        (b"\xff\xd8\xff\xe0 no pickle", "no pickle of plain values"),
         (pickle.dumps(VALUE)[:-30], "damaged"),
         (pickle.dumps(VALUE) + b"more", "damaged"),
         (b"\x80\x04\x8e" + b"\xff" * 8 + b".", "damaged"),
@@ -419,14 +391,10 @@ class Hostile:
 )
 def test_anything_else_is_one_line(tmp_path: Path, data: bytes, message: str) -> None:
     path = tmp_path / "theirs.pkl"
+    with pytest.raises(UserError, match="cannot be read"):
+        read_plain_pickle(path)
     path.write_bytes(data)
     with pytest.raises(UserError, match=message) as refused:
         read_plain_pickle(path)
     assert "\n" not in str(refused.value)
     assert not Path("/tmp/it_ran").exists()
-
-
-def test_a_missing_file_and_a_folder_are_one_line(tmp_path: Path) -> None:
-    for path in (tmp_path / "none.pkl", tmp_path):
-        with pytest.raises(UserError, match="cannot be read"):
-            read_plain_pickle(path)

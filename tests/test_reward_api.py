@@ -168,13 +168,9 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["0.mp4", "--index", "0"], "is not a set of episodes: leave --index out"),
         (["0.mp4", "--encoder", "gelsight_mini"], "has no touch: leave the encoder out"),
         (["0.mp4", "--gamma", "1.5"], "gamma"),
-        (["0.mp4", "--normalizer", "none.json"], "there is no normalizer at none.json"),
         (["one.mp4"], "has one frame: a curve needs at least 2"),
         (["episodes", "--camera", "wrist"], "choose --camera observation.images.front"),
         (["episodes", "--camera", "top"], "has no images of observation.images.top: choose"),
-        (["episodes", "--index", "7"], "has no episode 7; it has 0 to 2"),
-        (["episodes", "--goal", "frame:99"], "whose frames are 0 to 11"),
-        (["episodes", "--encoder", "nobody"], "there is no touch encoder 'nobody'"),
     ],
 )
 def test_mistakes_are_found_before_any_encoder_is_loaded(

@@ -19,7 +19,7 @@ from touchgoal.encoders.ssl import train
 from touchgoal.encoders.ssl.config import DINO_PRESETS, DinoConfig
 from touchgoal.encoders.ssl.dino import Dino
 from touchgoal.encoders.ssl.frames import sample_frames
-from touchgoal.encoders.ssl.masks import cover, cut, draw_blocks, draw_size, draw_targets
+from touchgoal.encoders.ssl.masks import cover, cut, draw_blocks, draw_targets
 from touchgoal.encoders.ssl.self_distillation import SelfDistillation
 from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.ssl.validation import token_statistics
@@ -103,21 +103,6 @@ def test_weight_decay_goes_along_a_cosine_for_matrices_alone() -> None:
     assert config.decay(10, 10) == pytest.approx(0.4)
     first, second = parameter_groups(toy_dino(), 0.04)
     assert min(p.ndim for p in first["params"]) == 2 and second["weight_decay"] == 0
-
-
-def test_blocks_are_rectangles_of_one_size() -> None:
-    grid = (8, 10)
-    for seed in range(20):
-        size = draw_size(grid, (0.15, 0.2), (0.75, 1.5), rng(seed))
-        assert 10 <= size[0] * size[1] <= 20 and 0.5 < size[0] / size[1] < 2
-        ids = draw_blocks(grid, size, 5, 4, rng(seed))
-        assert ids.shape == (5, 4, size[0] * size[1])
-        for block in ids.flatten(0, 1):
-            rows, columns = block // 10, block % 10
-            assert len(rows.unique()) == size[0] == rows.max() - rows.min() + 1
-            assert len(columns.unique()) == size[1] == columns.max() - columns.min() + 1
-    starts = draw_blocks((3, 3), (2, 2), 400, 1, rng())[:, 0, 0].unique()
-    assert starts.tolist() == [0, 1, 3, 4]
 
 
 def test_what_is_seen_is_not_asked_for() -> None:

@@ -6,10 +6,11 @@ import struct
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from numbered_pictures import until
 
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import DriverError
@@ -37,13 +38,6 @@ def line() -> Iterator[tuple[int, str]]:
             os.close(end)
         except OSError:
             pass  # a test unplugged it
-
-
-def until(holds: Callable[[], bool], seconds: float = 5.0) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, "it does not happen"
-        time.sleep(0.005)
 
 
 def counted(k: int) -> bytes:

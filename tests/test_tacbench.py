@@ -62,21 +62,6 @@ def test_shear_grows_with_the_slide_until_friction_gives_way() -> None:
     assert slides.tolist() == [False, False, True, True, False]
 
 
-def test_the_pad_slips_where_the_rig_slides() -> None:
-    """An elastic foundation under a ball: of the load, x^2 slips where a pull of 2x - x^2 is borne."""
-    bench = PressBench(Body(CATALOGUE["glass_ball"], (4e-3,), 0.1), MINI, rig_unit(RIG))
-    friction = CATALOGUE["glass_ball"].material.friction
-    bench.place(np.zeros(3))
-    for x in (0.3, 0.6, 0.9):
-        bench.sense(0.0, np.random.default_rng(0))
-        pull = friction * 2.0 * (2 * x - x * x)
-        depth = -2.0 / MINI.normal_stiffness
-        field = bench.sense(2.0, np.random.default_rng(0), (pull, 0.0), depth=depth).field
-        assert field is not None
-        assert field.slip_fraction == pytest.approx(x * x, abs=0.06)
-        assert field.wrench()[:3] == pytest.approx([pull, 0, -2.0], abs=1e-3)
-
-
 def test_a_stroke_is_untouched_pressed_and_drawn_the_same_each_time() -> None:
     stroke, again = simulate(RIG, 4), simulate(RIG, 4)
     assert np.array_equal(stroke.frames, again.frames) and stroke.indenter == "sharp"

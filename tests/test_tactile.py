@@ -121,19 +121,6 @@ def test_ball_sinks_as_the_elastic_foundation_says(force: float) -> None:
     assert carried == pytest.approx(force, rel=0.02)
 
 
-def test_mesh_feels_like_the_primitive_it_copies() -> None:
-    size = (0.006, 0.004, 0.010)
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
-    stone = next(k for k in CATALOGUE.values() if k.name == "pebble")
-    block = Body(type(stone)("block", "box", stone.material, ()), size, 0.1)
-    hull = Body(stone, (1.0,), 0.1, hull=corners)
-    at = np.array([1e-3, -0.5e-3, 0.0095])
-    one, other = sense(block, at), sense(hull, at)
-    inner = one.mask & other.mask
-    assert inner.sum() > 0.97 * one.mask.sum()
-    assert np.abs(one.depth - other.depth)[inner].mean() < 5e-6
-
-
 def test_contact_appears_where_it_is() -> None:
     ball = Body(CATALOGUE["glass_ball"], (0.01,), 0.1)
     dx, dy = 3e-3, -2e-3

@@ -90,30 +90,6 @@ def test_field_integrates_to_the_wrench(height: np.ndarray, contact: PadContact)
     assert beyond.max() < 0.001 * FRICTION * field.normal.max()
 
 
-@pytest.mark.parametrize("normal", [1e-6, 1.0, 80.0, 1e4])
-@pytest.mark.parametrize(
-    "height",
-    [
-        ball(0.0127, 0.0103),
-        ball(0.03, 0.0),
-        block(X.max() - 1e-5, 1, Y.max() - 1e-5, 1),
-        EVERYWHERE,
-        np.full_like(EVERYWHERE, NO_SURFACE),
-    ],
-    ids=["corner", "beside the gel", "one cell", "larger than the gel", "nothing"],
-)
-def test_degenerate_contacts_stay_finite(height: np.ndarray, normal: float) -> None:
-    far = wrench(normal, (0.05, -0.05), (normal, -normal), normal)  # no patch could bear that
-    contacts = wrench(normal), far, wrench(0.1 * normal)
-    motion = GelMotion(MINI, GRID, np.zeros((1, 2)))
-    for n in range(1, 4):
-        field, force = feel(height, *contacts[:n]), contacts[n - 1].force
-        assert np.isfinite(field.wrench()).all() and np.isfinite(field.slip_fraction)
-        assert np.isfinite(motion(field)).all()
-        if field.normal.any():
-            np.testing.assert_allclose(field.wrench()[:3], force, atol=1e-3 * normal)
-
-
 def test_tilt_carries_a_moment_and_nothing_tilts_without() -> None:
     upright = press_until_balanced(EVERYWHERE, GRID.pitch, wrench(20.0), 3e8, MINI)
     tilted = press_until_balanced(EVERYWHERE, GRID.pitch, wrench(20.0, (2e-3, 0.0)), 3e8, MINI)

@@ -206,22 +206,3 @@ def test_franka_stops_for_a_fault(
     assert error in said["said"] and said["mode"] == mode
     assert "rejected" in said["rejected"] and said["recovered"] == recovers
     assert fr3.at_rest()["worst"]["excess"] <= 0
-
-
-def two_moves(address: str, home: list[float]) -> dict:
-    import franky
-
-    robot = connect(address)
-    robot.move(franky.JointMotion(home))
-    robot.move(franky.JointMotion((np.array(home) + 0.2).tolist()))
-    return {}
-
-
-def test_lock_step_repeats(fr3: RunningTwin) -> None:
-    ends = []
-    for _ in range(2):
-        fr3.begin("reset 5")
-        through_franky(two_moves, fr3)
-        ends.append(fr3.ask("truth")["q"])
-    # franky may begin a millisecond earlier or later
-    np.testing.assert_allclose(*ends, rtol=0, atol=5e-4)

@@ -11,7 +11,7 @@ from fake_cell import FakeCell, FakeLoadCell
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.hand import HandMonitor, HeldObject
-from touchgoal.control.grippers.franka_hand import FrankaHandClient, NonBlockingGripper
+from touchgoal.control.grippers.franka_hand import NonBlockingGripper
 from touchgoal.control.interfaces import DriverError, GripperReading, LoadReading
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import FR3
@@ -219,94 +219,3 @@ def test_a_stopped_gripper_is_sent_no_width_again() -> None:
         time.sleep(0.01)
         gripper.close()
         assert slow.late == 0
-
-
-class HandState:
-    """What franky says of a hand."""
-
-    def __init__(self) -> None:
-        self.width, self.max_width, self.is_grasped = 0.06, 0.08, False
-        self.time, self.ticks = self, 0
-
-    def to_msec(self) -> int:
-        self.ticks += 1
-        return self.ticks
-
-
-class Running:
-    """franky's promise of an answer."""
-
-    def __init__(self) -> None:
-        self.done = False
-
-    def wait(self, seconds: float) -> bool:
-        return self.done
-
-    def get(self) -> bool:
-        return False  # it met something
-
-
-class Hand:
-    """franky's gripper."""
-
-    def __init__(self) -> None:
-        self.state, self.running, self.orders = HandState(), Running(), []
-
-    def move_async(self, width: float, speed: float) -> Running:
-        self.orders.append(f"move {width:.2f}")
-        return self.running
-
-    def grasp_async(self, *_: float, **__: float) -> Running:
-        self.orders.append("grasp")
-        return self.running
-
-    def stop_async(self) -> Running:
-        self.orders.append("stop")
-        return Running()
-
-
-@pytest.fixture
-def hand(monkeypatch: pytest.MonkeyPatch) -> tuple[FrankaHandClient, Hand]:
-    made = Hand()
-    monkeypatch.setattr(
-        "touchgoal.control.arms.client_libraries.ClientLibrary.load",
-        lambda *_: type("Client", (), {"Gripper": staticmethod(lambda address: made)}),
-    )
-    return FrankaHandClient("here", 30.0), made
-
-
-def test_a_stopped_hand_does_not_grasp_what_its_last_move_met(
-    hand: tuple[FrankaHandClient, Hand],
-) -> None:
-    client, franky = hand
-    client.command(0.02)
-    for _ in range(2):  # a width that stays is sent, one that passes is not
-        client.tick()
-    client.stop()
-    franky.running.done = True
-    for _ in range(3):
-        client.tick()
-    assert franky.orders == ["move 0.02", "stop"]
-    with pytest.raises(DriverError, match="stopped"):
-        client.command(0.05)
-
-
-def test_a_hand_that_is_to_let_go_opens_and_does_no_more(
-    hand: tuple[FrankaHandClient, Hand],
-) -> None:
-    client, franky = hand
-    client.command(0.02)
-    for _ in range(2):  # a width that stays is sent, one that passes is not
-        client.tick()
-    client.stop(release_to=0.07)
-    for _ in range(3):
-        client.tick()
-    assert franky.orders == ["move 0.02", "stop", "move 0.07"]
-
-
-def test_a_hands_fault_reaches_the_reading(hand: tuple[FrankaHandClient, Hand]) -> None:
-    client, franky = hand
-    franky.state = None  # pyright: ignore
-    client.tick()
-    assert "AttributeError" in client.read().fault
-    assert FR3.tool.stroke[0] <= client.read().width

@@ -1,7 +1,8 @@
-"""Clients that are not ours against the twin, and our driver against controllers that are not ours.
+"""Franka's own client against the twin, and our driver against controllers that are not ours.
 
-    python tests/interop/run.py [NAME ...]      NAME: pylibfranka, franky, ur_rtde, franka-sim, franky-sim;
-                                                none: all
+    python tests/interop/run.py [NAME ...]      NAME: pylibfranka, franka-sim, franky-sim; none: all
+
+franky and ur-rtde drive the twin in test_twin_franka.py and test_twin_ur.py.
 
 What is not ours runs in the virtual environment `.venv-interop` (`make interop` makes it), each in a process
 of its own. It prints what each one found, and fails if that is wrong.
@@ -11,7 +12,6 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,44 +44,14 @@ def check_pylibfranka(said: dict[str, Any]) -> dict[str, bool]:
     }
 
 
-def check_franky(said: dict[str, Any]) -> dict[str, bool]:
-    """Its hand points down: 3 cm along its own axis is 3 cm down."""
-    return {
-        "joints": near(said["joint"], 0.1),
-        "Cartesian": near(said["cartesian"], [0, 0, -0.03], 0.01),
-        "velocity": 0.05 < said["velocity"][0] < 0.12,
-        "hand": near(said["width"], 0.05) and said["air"] is False,
-        "gravity is felt": said["gravity"] > 5,
-    }
-
-
-def check_ur_rtde(said: dict[str, Any]) -> dict[str, bool]:
-    """Commanded: 0.1 rad, 0.05 m up, 0.05 rad of the first joint."""
-    return {
-        "moveJ": near(said["moveJ"], 0.1),
-        "moveL": near(said["moveL"], [0, 0, 0.05]),
-        "servoJ": near(said["servoJ"], [0.05, 0, 0, 0, 0, 0]),
-        "dashboard": said["dashboard"] == ["Robotmode: RUNNING", "Safetystatus: NORMAL", True],
-    }
-
-
-CLIENTS: dict[str, tuple[str, Callable[[dict[str, Any]], dict[str, bool]]]] = {
-    "pylibfranka": ("fr3", check_pylibfranka),
-    "franky": ("fr3", check_franky),
-    "ur_rtde": ("ur5e", check_ur_rtde),
-}
-
-
-def run(name: str, number: int) -> bool:
-    """One client on a twin of its own; whether all is as it should be."""
-    arm, check = CLIENTS[name]
+def run_pylibfranka(number: int) -> bool:
+    """The client on a twin; whether all is as it should be."""
     cell = ["--env.objects", "wooden_block", "--seed", "3", "--env.cameras", "--env.no-tactile"]
-    lock_step = ["--lock-step"] if arm == "fr3" else []
     with tempfile.TemporaryDirectory() as folder:
-        twin = RunningTwin(["--arm", arm, *lock_step, *cell], Path(folder), number)
+        twin = RunningTwin(["--arm", "fr3", "--lock-step", *cell], Path(folder), number)
         try:
             done = subprocess.run(
-                [str(PYTHON), str(HERE / f"{name}_client.py"), twin.cell.address],
+                [str(PYTHON), str(HERE / "pylibfranka_client.py"), twin.cell.address],
                 capture_output=True,
                 text=True,
                 timeout=_TIMEOUT,
@@ -89,10 +59,10 @@ def run(name: str, number: int) -> bool:
         finally:
             twin.close()
     if done.returncode != 0:
-        print(f"{name}: it failed: {done.stderr.strip().splitlines()[-1:]}", flush=True)
+        print(f"pylibfranka: it failed: {done.stderr.strip().splitlines()[-1:]}", flush=True)
         return False
     said = json.loads(done.stdout.splitlines()[-1])
-    return report(name, check(said), str(said))
+    return report("pylibfranka", check_pylibfranka(said), str(said))
 
 
 def report(name: str, found: dict[str, bool], said: str) -> bool:
@@ -113,10 +83,10 @@ def run_emulator(name: str, number: int) -> bool:
 
 
 if __name__ == "__main__":
-    everything = [*CLIENTS, *COMMANDS]
-    names = sys.argv[1:] or everything
-    results = [
-        (run if name in CLIENTS else run_emulator)(name, 20 + everything.index(name))
-        for name in names
-    ]
+    everything = ["pylibfranka", *COMMANDS]
+    results = []
+    for name in sys.argv[1:] or everything:
+        number = 20 + everything.index(name)
+        own = run_pylibfranka(number) if name == "pylibfranka" else run_emulator(name, number)
+        results.append(own)
     sys.exit(0 if all(results) else 1)
