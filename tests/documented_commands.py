@@ -136,8 +136,8 @@ def snippets(page: Path) -> list[str]:
 def recipes(target: str) -> list[list[str]]:
     """Words of the commands that a target of the Makefile runs, in the first round of its loops."""
     asked = ["make", "-n", "-s", "-C", str(ROOT), target]
-    told = subprocess.run(asked, check=True, capture_output=True, text=True).stdout
-    told = re.sub(r"\$\(\(.*?\)\)", "1", told.replace("\\\n", " "))
-    told = re.sub(r"\$\{?round\}?", "1", told)
-    found = re.findall(r"\.venv/bin/touchgoal ([^;&|\n]*)", told)
+    output = subprocess.run(asked, check=True, capture_output=True, text=True).stdout
+    output = re.sub(r"\$\(\(.*?\)\)", "1", output.replace("\\\n", " "))
+    output = re.sub(r"\$\{?round\}?", "1", output)
+    found = re.findall(r"\.venv/bin/touchgoal ([^;&|\n]*)", output)
     return [shlex.split(line) for line in found]

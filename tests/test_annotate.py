@@ -282,14 +282,14 @@ def test_command_with_real_classes(
     options = ["--root", str(twenty.root), "--detector", detector, "--captioner", captioner]
     options += ["--min-score", "0", "--min-overlap", "0", "--out", str(tmp_path / "out")]
     main(["annotate", str(list_), *options, "--sensor-box", "7", "7", "33", "33"])
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert metrics["recordings"] == 2 and f"{metrics['annotated']} of 2 recordings" in said
+    assert metrics["recordings"] == 2 and f"{metrics['annotated']} of 2 recordings" in printed
     for record in by_recording(tmp_path / "out").values():
         assert record.provenance["detector"] == detector and "CSRT" in record.provenance["tracker"]
         assert all("What specific" not in i.caption for i in record.instances)
     for reason in metrics["left_out"]:
-        assert reason in said
+        assert reason in printed
 
 
 def test_bad_input_is_one_line(
@@ -310,7 +310,7 @@ def test_bad_input_is_one_line(
     for message, options in tries.items():
         with pytest.raises(SystemExit) as stop:
             main(["annotate", *options, "--out", str(tmp_path / "out")])
-        told = f"{stop.value.code} {capsys.readouterr().err}"
-        assert message in told, told
-        assert "Traceback" not in told
+        complaint = f"{stop.value.code} {capsys.readouterr().err}"
+        assert message in complaint, complaint
+        assert "Traceback" not in complaint
     assert not (tmp_path / "out").exists()

@@ -45,8 +45,8 @@ def goal(e: EmbeddedEpisode) -> EmbeddedGoal:
 
 def measure(e: EmbeddedEpisode, to: EmbeddedGoal) -> Curves:
     assert to.touch is not None
-    felt = 1 - (e.touches() * to.touch).sum(-1).mean(0).astype(float)
-    costs = {"fused": 0.5 * (1 - e.pictures()[:, 0]) + 0.5 * felt}
+    touch_cost = 1 - (e.touches() * to.touch).sum(-1).mean(0).astype(float)
+    costs = {"fused": 0.5 * (1 - e.pictures()[:, 0]) + 0.5 * touch_cost}
     return Curves(e.source, {}, e.fps, e.contact, costs, {})
 
 
@@ -55,9 +55,9 @@ def shuffled(e: EmbeddedEpisode) -> EmbeddedEpisode:
 
 
 def test_the_verdict_is_yes_where_touch_tells_and_no_where_it_was_shuffled() -> None:
-    told = [episode(k, success=k % 4 != 3) for k in range(40)]
-    goals = [goal(e) for e in told]
-    audit = audit_touch(told, goals, measure)
+    episodes = [episode(k, success=k % 4 != 3) for k in range(40)]
+    goals = [goal(e) for e in episodes]
+    audit = audit_touch(episodes, goals, measure)
     assert audit.mattered and audit.verdict.startswith("touch mattered: shuffled in time")
     assert "another episode's touch ends" in audit.verdict and "farther away" in audit.verdict
     rows = {(r.metric, r.replacement): r for r in audit.rows}
@@ -66,8 +66,8 @@ def test_the_verdict_is_yes_where_touch_tells_and_no_where_it_was_shuffled() -> 
     assert rows["AUC", "neutral"].high < -0.1
     same = rows["last cost", "mirrored"]  # both fingertips feel the same here
     assert same.low <= 0 <= same.high
-    told_nothing = [shuffled(e) for e in told]
-    audit = audit_touch(told_nothing, goals, measure)
+    shuffled_episodes = [shuffled(e) for e in episodes]
+    audit = audit_touch(shuffled_episodes, goals, measure)
     assert not audit.mattered and "no sign that touch mattered" in audit.table
 
 

@@ -134,8 +134,10 @@ def test_it_takes_touch(maze: BeadMaze) -> None:
     wrenches = [tick[ft.WRENCH] for tick in other]
     for name in ("fourier-3", "serpentine-5"):
         assert lead(maze, follower, find(name))[-1][ft.TRUTH_SUCCESS]
-    for felt in ([], wrenches):
-        ticks = lead(maze, lambda env, felt=felt: FeelsSomethingElse(felt), find("serpentine-5"))
+    for forces in ([], wrenches):
+        ticks = lead(
+            maze, lambda env, forces=forces: FeelsSomethingElse(forces), find("serpentine-5")
+        )
         assert ticks[-1][ft.TRUTH_FAILURE].any()
         assert max(tick[ft.TRUTH_PROGRESS] for tick in ticks) < 0.6
 

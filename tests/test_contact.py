@@ -170,9 +170,9 @@ def test_wrenches_and_slip_are_mujocos() -> None:
             if geom not in contact.geom or contact.efc_address < 0:
                 continue
             towards = 1.0 if contact.geom[1] == geom else -1.0
-            felt = np.zeros(6)
-            mujoco.mj_contactForce(model, data, i, felt)
-            force, torque = towards * felt.reshape(2, 3) @ contact.frame.reshape(3, 3)
+            solved = np.zeros(6)
+            mujoco.mj_contactForce(model, data, i, solved)
+            force, torque = towards * solved.reshape(2, 3) @ contact.frame.reshape(3, 3)
             wrench[:3] += force
             wrench[3:] += torque + np.cross(contact.pos - site.xpos, force)
             external[:3] += force
@@ -211,7 +211,7 @@ def touch_episode(seed: int, truth: bool) -> Episode:
     if truth:
         frames[ft.TRUTH_CONTACT] = contact
     descriptions = [f"feels like {seed}", "hard"]
-    return Episode(frames, "touch", {"object": f"thing_{seed}", "descriptions": descriptions})
+    return Episode(frames, "touch", {"object": f"object_{seed}", "descriptions": descriptions})
 
 
 @pytest.mark.parametrize("truth", [True, False])
@@ -224,9 +224,9 @@ def test_touches(tmp_path: Path, truth: bool) -> None:
         episodes, contact_frames_per_episode=8, no_contact_frames_per_episode=3, seed=0
     )
     assert len(touches) == 2 * (8 + 3) + 3
-    assert [touches.object.count(name) for name in ("thing_0", "thing_1", "")] == [8, 8, 9]
+    assert [touches.object.count(name) for name in ("object_0", "object_1", "")] == [8, 8, 9]
     assert len(touches.background) == 2 * len(touches.view) == 6
-    assert touches.descriptions["thing_1"] == ["feels like 1", "hard"]
+    assert touches.descriptions["object_1"] == ["feels like 1", "hard"]
     bumped = touches.frames.astype(int) - touches.background[touches.background_index]
     touched = bumped[:, 50, 60, 0] > 15
     assert touched.tolist() == [name != "" for name in touches.object]

@@ -97,8 +97,8 @@ def test_a_stalled_camera_stops_the_arm_and_the_episode_is_kept(
     twin.ask("stall front 0")  # a program that ends waits for the picture on its way
     _, complaint = process.communicate(timeout=_PATIENCE)
     assert process.returncode == STOPPED and "observation age" in complaint and "front" in complaint
-    said = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert said["stopped"] and said["rest_seconds"] < 3 and "cable" in said["advice"]
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["stopped"] and metrics["rest_seconds"] < 3 and "cable" in metrics["advice"]
     episodes = tmp_path / "run" / "episodes"
     meta = EpisodeSet(episodes).meta(0)
     assert meta["outcome"] == "stopped" and meta["success"] is False and validate(episodes) == []
@@ -108,9 +108,9 @@ def test_a_simulated_arm_reaches_the_same_outcome(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     run("deploy", write_cell_file(tmp_path, SIM), "--execute", "--yes", "--out", tmp_path / "run")
-    said = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     meta = EpisodeSet(tmp_path / "run" / "episodes").meta(0)
-    assert said["success"] and meta["arm"] == "sim" and meta["success"] is True
+    assert metrics["success"] and meta["arm"] == "sim" and meta["success"] is True
     printed = capsys.readouterr().out
     assert "the hand still holds something" in printed and "task: done" in printed
 
@@ -146,9 +146,9 @@ def test_a_disk_that_fills_up_costs_one_episode_and_is_said_in_a_line(
     capsys.readouterr()
     with pytest.raises(SystemExit) as ended:
         run(*arguments)
-    said = capsys.readouterr()
-    assert "ticks of the control loop" in said.out and "ended: time is up" in said.out
-    assert "could not be saved" in f"{ended.value.code}{said.err}"
+    printed = capsys.readouterr()
+    assert "ticks of the control loop" in printed.out and "ended: time is up" in printed.out
+    assert "could not be saved" in f"{ended.value.code}{printed.err}"
     full.unlink()
     assert len(EpisodeSet(small_disk / "run" / "episodes")) == 1
     assert not any(
@@ -159,8 +159,8 @@ def test_a_disk_that_fills_up_costs_one_episode_and_is_said_in_a_line(
 def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:
     text = SIM.replace("seed = 3", "seed = 3, seconds = 1.0")
     run("deploy", write_cell_file(tmp_path, text), "--out", tmp_path / "run")
-    said = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert said["ticks"] > 10 and said["episode"] is None and not said["success"]
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["ticks"] > 10 and metrics["episode"] is None and not metrics["success"]
 
 
 def test_time_up_has_an_exit_status_and_is_recorded_as_no_success(tmp_path: Path) -> None:
@@ -237,8 +237,8 @@ def test_a_wrong_policy_of_ones_own_stops_the_arm_with_its_name(
     with pytest.raises(SystemExit) as ended:
         run("deploy", write_cell_file(tmp_path, SIM), "--policy", f"{tmp_path / 'own.py'}:Turns",
             "--execute", "--yes", "--out", tmp_path / "run")  # fmt: skip
-    said = capsys.readouterr().err
-    assert ended.value.code == STOPPED and message in said and "own.py" in said
+    printed = capsys.readouterr().err
+    assert ended.value.code == STOPPED and message in printed and "own.py" in printed
 
 
 def test_an_interrupted_pipe_keeps_the_report_and_the_status(tmp_path: Path) -> None:
@@ -256,9 +256,9 @@ def test_an_interrupted_pipe_keeps_the_report_and_the_status(tmp_path: Path) -> 
         assert line, process.stderr.read()
     process.stdout.close()
     process.send_signal(signal.SIGINT)
-    said = process.stderr.read()
+    printed = process.stderr.read()
     assert process.wait(_PATIENCE) == STOPPED
-    assert "STOPPED: stopped by the operator" in said and "at rest after" in said
+    assert "STOPPED: stopped by the operator" in printed and "at rest after" in printed
 
 
 def test_the_policy_is_loaded_once_and_before_anything_else(

@@ -63,8 +63,8 @@ def test_command_is_understood(
     except SystemExit as end:
         if not end.code:  # it printed something and is done, as --recorded
             return
-        told = capsys.readouterr().err
-        assert not command.whole and "required" in told.lower(), told
+        complaint = capsys.readouterr().err
+        assert not command.whole and "required" in complaint.lower(), complaint
 
 
 @pytest.mark.parametrize(
@@ -164,9 +164,9 @@ def _the_job_is_done(desk: Path, cell_file: Path, shell: Shell) -> None:
     [job] = [command for command in DEPLOYING if command.line == THE_JOB]
     run = desk / "runs" / "job"
     assert shell([*job.small, "--out", str(run)]) == 0
-    said = json.loads((run / "metrics.json").read_text())
-    assert said["success"] and not said["stopped"] and said["episode"] == 0
-    assert 0.03 < said["held_width"] < 0.07
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["success"] and not metrics["stopped"] and metrics["episode"] == 0
+    assert 0.03 < metrics["held_width"] < 0.07
     worst = ask_twin(read_cell_file(cell_file).task.twin, "truth")["worst"]
     assert worst["excess"] == 0 and worst["speed"] < 1
     assert shell(["reward-curves", str(run / "episodes"), "--out", str(run / "curves")]) == 0

@@ -136,11 +136,11 @@ def test_commands_take_jitter_and_leave_faults_out(
     write_lerobot_set(tmp_path / "train", train)
     write_lerobot_set(tmp_path / "validation", [arm_frames(9), arm_frames(10)])
     main(["reward-curves", str(tmp_path / "train"), "--out", str(tmp_path / "curves")])
-    assert "1 of 3 skipped" in (said := capsys.readouterr().out) and "one camera" in said
+    assert "1 of 3 skipped" in (printed := capsys.readouterr().out) and "one camera" in printed
     assert "frame 20 has the time stamp" in (tmp_path / "curves/skipped.csv").read_text()
     options = "--include-unknown --task pick-place --trials 0 --train.epochs 1".split()
     data = ["--data", str(tmp_path / "train"), "--validation", str(tmp_path / "validation")]
     main(["train-policy", *data, *options, "--out", str(tmp_path / "policy")])
-    said = capsys.readouterr()
-    assert "2 episodes for training, 2 episodes for validation" in said.out
-    assert "episode 1 of" in said.err and "frame 20 has the time stamp" in said.err
+    printed = capsys.readouterr()
+    assert "2 episodes for training, 2 episodes for validation" in printed.out
+    assert "episode 1 of" in printed.err and "frame 20 has the time stamp" in printed.err

@@ -25,7 +25,7 @@ def success(seed: int = 0, contact: int = CONTACT) -> Episode:
         FRONT: moving_blob(LENGTH, 32, 48, seed),
         STATE: np.zeros((LENGTH, 15), np.float32),
     }
-    meta = {"outcome": "success", "success": True, "seed": seed, "object": f"thing {seed}"}
+    meta = {"outcome": "success", "success": True, "seed": seed, "object": f"object {seed}"}
     return Episode(frames, "place it", meta)
 
 

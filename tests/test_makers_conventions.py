@@ -57,11 +57,11 @@ def test_franka_signs_frames_and_units(fr3: RunningTwin) -> None:
     """
     fr3.begin("reset 3")
     fr3.ask("nudge {} {} {} 600".format(*PUSH))
-    said = client(reads_franka, fr3.cell.address, [])
+    state = client(reads_franka, fr3.cell.address, [])
     fr3.ask("nudge 0 0 0 0")
-    np.testing.assert_allclose(said["O"][:3], -PUSH, atol=0.2)
-    O_T_EE = np.array(said["O_T_EE"])
-    np.testing.assert_allclose(O_T_EE[:3, :3] @ said["K"][:3], said["O"][:3], atol=0.01)
+    np.testing.assert_allclose(state["O"][:3], -PUSH, atol=0.2)
+    O_T_EE = np.array(state["O_T_EE"])
+    np.testing.assert_allclose(O_T_EE[:3, :3] @ state["K"][:3], state["O"][:3], atol=0.01)
     quarter = np.pi / 2
     table = [
         (0, 0.333, 0),
@@ -73,22 +73,22 @@ def test_franka_signs_frames_and_units(fr3: RunningTwin) -> None:
         (0.088, 0, quarter),
         (0, 0.107, 0),  # the flange
     ]
-    q = np.array([*said["q"], 0.0])
+    q = np.array([*state["q"], 0.0])
     O_T_F = dh(table, q, craig=True)
-    np.testing.assert_allclose(O_T_EE, O_T_F @ np.array(said["F_T_EE"]), atol=1e-4)
+    np.testing.assert_allclose(O_T_EE, O_T_F @ np.array(state["F_T_EE"]), atol=1e-4)
     # The torques that the same wrench makes, by the flange's numerical Jacobian.
     moved = O_T_EE[:3, 3]
     J = np.stack(
         [
-            (dh(table, q + 1e-6 * np.eye(8)[i], craig=True) @ np.array(said["F_T_EE"]))[:3, 3]
+            (dh(table, q + 1e-6 * np.eye(8)[i], craig=True) @ np.array(state["F_T_EE"]))[:3, 3]
             - moved
             for i in range(7)
         ],
         axis=1,
     )
     torques = (J / 1e-6).T @ -PUSH  # the hand's own point differs from the TCP's: signs and sizes
-    assert np.dot(torques, said["tau"]) > 0.5 * np.linalg.norm(torques) ** 2
-    x, y, z, w = said["quaternion_xyzw"]
+    assert np.dot(torques, state["tau"]) > 0.5 * np.linalg.norm(torques) ** 2
+    x, y, z, w = state["quaternion_xyzw"]
     np.testing.assert_allclose(O_T_EE[2, 2], 1 - 2 * (x * x + y * y), atol=1e-5)
     np.testing.assert_allclose(O_T_EE[1, 0], 2 * (x * y + w * z), atol=1e-5)
 
@@ -109,13 +109,13 @@ def reads_ur(address: str) -> dict:
 
     receive = RTDEReceiveInterface(address)
     time.sleep(0.3)
-    said = {
+    state = {
         "force": receive.getActualTCPForce(),
         "pose": receive.getActualTCPPose(),
         "q": receive.getActualQ(),
     }
     receive.disconnect()
-    return said
+    return state
 
 
 @pytest.mark.realtime
@@ -125,9 +125,9 @@ def test_ur_signs_frames_and_units(ur5e: RunningTwin) -> None:
     """
     ur5e.begin("reset 3")
     ur5e.ask("nudge {} {} {} 600".format(*PUSH))
-    said = client(reads_ur, ur5e.cell.address)
+    state = client(reads_ur, ur5e.cell.address)
     ur5e.ask("nudge 0 0 0 0")
-    np.testing.assert_allclose(said["force"][:3], PUSH, atol=0.5)
+    np.testing.assert_allclose(state["force"][:3], PUSH, atol=0.5)
     quarter = np.pi / 2
     table = [
         (0, 0.1625, quarter),
@@ -137,8 +137,8 @@ def test_ur_signs_frames_and_units(ur5e: RunningTwin) -> None:
         (0, 0.0997, -quarter),
         (0, 0.0996, 0),
     ]
-    flange = dh(table, np.array(said["q"]), craig=False)
-    position, vector = np.array(said["pose"][:3]), np.array(said["pose"][3:])
+    flange = dh(table, np.array(state["q"]), craig=False)
+    position, vector = np.array(state["pose"][:3]), np.array(state["pose"][3:])
     angle = np.linalg.norm(vector)
     K = np.cross(np.eye(3), vector / angle)
     R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K  # Rodrigues
@@ -165,8 +165,8 @@ def test_drivers_say_what_the_environment_does_to_the_robot(
         twin_time = twin.ask("truth")["time"]
         while twin.ask("truth")["time"] < twin_time + 0.3:
             pass
-        felt = arm.read()
-        np.testing.assert_allclose((felt.wrench - before.wrench)[:3], PUSH, atol=0.5)
+        pushed = arm.read()
+        np.testing.assert_allclose((pushed.wrench - before.wrench)[:3], PUSH, atol=0.5)
     finally:
         twin.ask("nudge 0 0 0 0")
         arm.close()

@@ -80,11 +80,11 @@ def test_retrieval_knows_the_right_answer_and_chance() -> None:
     data = made_up()
     every = Fold(np.arange(0), np.arange(TOUCHES), np.ones(40, bool), np.ones(40, bool))
     one_hot = np.eye(OBJECTS)
-    told = {"touch": one_hot[data.label], "image": one_hot[data.label]}
-    told["text"] = one_hot[data.describes.argmax(0)]
-    blind = {name: np.zeros_like(rows) for name, rows in told.items()}
-    assert judge(data, every, told).keys() == PUBLISHED.keys()
-    for _, precision in judge(data, every, told).values():
+    known = {"touch": one_hot[data.label], "image": one_hot[data.label]}
+    known["text"] = one_hot[data.describes.argmax(0)]
+    blind = {name: np.zeros_like(rows) for name, rows in known.items()}
+    assert judge(data, every, known).keys() == PUBLISHED.keys()
+    for _, precision in judge(data, every, known).values():
         assert precision.mean() == pytest.approx(1)
     for direction, (_, precision) in judge(data, every, blind).items():
         assert 0.1 < precision.mean() < 0.19, direction

@@ -93,8 +93,8 @@ def test_record_presses_writes_what_calibrate_reads(
     pictures.mkdir()
     for i, frame in enumerate(session):
         cv2.imwrite(str(pictures / f"{i:04d}.png"), frame[..., ::-1])
-    options = "--mm-per-pixel 0.059 --presses-per-part 1 --no-calibrate --out".split()
-    options.append(str(out))
+    sizes = "--mm-per-pixel 0.059 --presses-per-part 1 --no-calibrate"
+    options = [*sizes.split(), "--out", str(out)]
     main(["record-presses", str(pictures), "--ball-mm", "4", *options])
     main(["record-presses", str(pictures), "--ball-mm", "5", "--resume", *options])
     presses = read_presses(out / "presses", 0.059e-3)

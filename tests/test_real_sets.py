@@ -123,7 +123,7 @@ def test_objectfolder_real(tmp_path: Path) -> None:
         picture = np.full((320, 240, 3), 100.0)
         picture[:10, :, 2] = 40 * i  # red at the top
         write_picture(tmp_path / "touch" / f"{i:03d}.png", picture)
-        rows.append((i, f"thing_{i}", material))
+        rows.append((i, f"object_{i}", material))
     write_table(tmp_path / "objects.csv", *rows)
     write_picture(tmp_path / "picture" / "002.jpg", np.zeros((8, 8, 3)))
     objects = read_objectfolder_real(tmp_path)

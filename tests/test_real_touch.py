@@ -35,10 +35,10 @@ from touchgoal.runtime.errors import UserError
 Y, X = np.mgrid[:60, :80].astype(np.float32)
 
 
-def press(thing: int, frames: int = 9) -> np.ndarray:
-    """Stripes whose width and colour tell the thing, after three untouched frames."""
-    rng = np.random.default_rng(thing)
-    stripes = 60 * np.sin(X / (4 + 2 * thing))[..., None] * [1, 0.5 * thing, -1]
+def press(obj: int, frames: int = 9) -> np.ndarray:
+    """Stripes whose width and colour tell the object, after three untouched frames."""
+    rng = np.random.default_rng(obj)
+    stripes = 60 * np.sin(X / (4 + 2 * obj))[..., None] * [1, 0.5 * obj, -1]
     gel = 100 + rng.normal(0, 1, (frames, 60, 80, 3))
     pressed = np.arange(frames)[:, None, None, None] >= 5
     return (gel + pressed * stripes).clip(0, 255).astype(np.uint8)
@@ -51,13 +51,13 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with (folder / "labels.csv").open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow("file object name split hardness roughness bumpiness".split())
-        for thing in range(6):
+        for obj in range(6):
             for take in range(3):
-                name = f"thing{thing}_{take}.mp4"
-                write_video(folder / "videos" / name, press(thing), 10)
-                split = ("val" if thing % 3 == 2 else "train") if thing < 5 else "unlabelled"
-                ranks = [thing % 3, thing // 2, 1] if thing < 5 else ["", "", ""]
-                rows.writerow([name, f"thing{thing}", f"thing {thing}", split, *ranks])
+                name = f"object{obj}_{take}.mp4"
+                write_video(folder / "videos" / name, press(obj), 10)
+                split = ("val" if obj % 3 == 2 else "train") if obj < 5 else "unlabelled"
+                ranks = [obj % 3, obj // 2, 1] if obj < 5 else ["", "", ""]
+                rows.writerow([name, f"object{obj}", f"object {obj}", split, *ranks])
     return folder
 
 
@@ -73,36 +73,36 @@ def test_the_benchmark_judges_encoders(clips: Path) -> None:
 
 
 def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
-    """What differs between videos of one thing counts less then; other things stay apart."""
+    """What differs between videos of one object counts less then; other objects stay apart."""
     main(["train-encoder", "adapt", "--data", str(clips), "--share", "0.9", "--out", str(tmp_path)])
     adapted = load_encoder(tmp_path / "encoder")
     goals = adapted.embed_text_goal(["a soft object", "a slightly hard object"], OfflineTowers())
-    touches = [adapted.embed(press(thing))[5:].mean(0) for thing in (0, 1)]
+    touches = [adapted.embed(press(obj))[5:].mean(0) for obj in (0, 1)]
     assert (goals @ np.stack(touches, 1)).argmax(1).tolist() == [0, 1]
-    videos = [v for v in read_labelled_videos(clips) if v.object in ("thing0", "thing1")]
+    videos = [v for v in read_labelled_videos(clips) if v.object in ("object0", "object1")]
     names = np.array([v.object for v in videos])
 
     def apart(encoder: BaseTouchEncoder) -> float:
-        """Squared distances within things, as a share of those between them."""
+        """Squared distances within objects, as a share of those between them."""
         seen = np.stack([encoder.embed(v.frames())[5:].mean(0) for v in videos])
-        means = np.stack([seen[names == name].mean(0) for name in ("thing0", "thing1")])
-        within = np.square(seen - means[(names == "thing1").astype(int)]).sum(1).mean()
+        means = np.stack([seen[names == name].mean(0) for name in ("object0", "object1")])
+        within = np.square(seen - means[(names == "object1").astype(int)]).sum(1).mean()
         return float(within / np.square(means[0] - means[1]).sum())
 
     assert apart(adapted) < 0.7 * apart(load_encoder("gelsight_mini_surfaces"))
 
 
-def test_sentences_are_judged_on_things_never_seen() -> None:
+def test_sentences_are_judged_on_objects_never_seen() -> None:
     """Where touch says the ranks, sentences find them; where it does not, they do no better than guesses."""
     rng = np.random.default_rng(0)
     ranks = rng.integers(0, 3, (120, 3))
-    things = np.array([f"thing{i // 2}" for i in range(120)])
+    objects = np.array([f"object{i // 2}" for i in range(120)])
     ranks[1::2] = ranks[::2]
-    told = np.eye(3)[ranks].reshape(120, 9) @ rng.normal(size=(9, 30))
+    embedded = np.eye(3)[ranks].reshape(120, 9) @ rng.normal(size=(9, 30))
     noise = rng.normal(size=(120, 30))
     embed_texts = OfflineTowers().embed_texts
-    assert sentences_right(told + 0.3 * noise, ranks, things, embed_texts).mean() > 0.9
-    assert sentences_right(noise, ranks, things, embed_texts).mean() < 0.5
+    assert sentences_right(embedded + 0.3 * noise, ranks, objects, embed_texts).mean() > 0.9
+    assert sentences_right(noise, ranks, objects, embed_texts).mean() < 0.5
 
 
 def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
@@ -121,10 +121,10 @@ def test_sentences_lie_where_what_they_tell_of_is_felt() -> None:
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(3, 3, 40))
     ranks = np.array([[i, j, k] for i in range(3) for j in range(3) for k in range(3)])
-    felt = directions[0, ranks[:, 0]] + directions[1, ranks[:, 1]] + directions[2, ranks[:, 2]]
+    touch = directions[0, ranks[:, 0]] + directions[1, ranks[:, 1]] + directions[2, ranks[:, 2]]
     unseen = (ranks == (0, 2, 1)).all(1)
     towers = OfflineTowers()
-    centred = torch.from_numpy(felt - felt.mean(0)).float()
+    centred = torch.from_numpy(touch - touch.mean(0)).float()
     head = fit_text_head(centred[~unseen], torch.from_numpy(ranks[~unseen]), towers.embed_texts)
     for k in range(3):
         near = centred[unseen] @ head(towers.embed_texts(rank_sentences(k))).T
@@ -186,7 +186,7 @@ def test_forces_come_with_their_frames(tmp_path: Path) -> None:
     [
         (lambda t: t.replace("hardness", "firmness"), "lacks the column hardness"),
         (lambda t: t.replace(",0,0,1", ",7,0,1"), "a rank that is not 0, 1 or 2"),
-        (lambda t: t.replace("thing0_0.mp4", "lost.mp4"), "names lost.mp4"),
+        (lambda t: t.replace("object0_0.mp4", "lost.mp4"), "names lost.mp4"),
     ],
 )
 def test_unfit_labels_are_refused(clips: Path, tmp_path: Path, damage, says: str) -> None:
@@ -213,7 +213,7 @@ def test_properties_of_unseen_objects_are_predicted() -> None:
     assert (shuffled.ranks == ranks).mean() < 0.45  # chance, for no strength is chosen on them
 
 
-def test_force_is_read_of_another_thing() -> None:
+def test_force_is_read_of_another_object() -> None:
     """Calibrated on blocks that press wider with force, read on narrower ones."""
 
     def grasp(width: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -235,46 +235,46 @@ def test_force_is_read_of_another_thing() -> None:
         calibrate_force(rows[:20], force[:20])
 
 
-def test_the_cost_falls_with_the_touch_and_tells_the_wrong_thing() -> None:
-    """Two things, felt along two directions; 0.5 N from the sixth frame on."""
+def test_the_cost_falls_with_the_touch_and_tells_the_wrong_object() -> None:
+    """Two objects, felt along two directions; 0.5 N from the sixth frame on."""
     strength = np.array([0, 0, 0, 0, 0, 0.4, 0.7, 1, 1, 1])
 
     def grasp(trial: int) -> EmbeddedGrasp:
         seen = strength[:, None] * np.eye(2)[trial // 2] + 0.01 * trial
-        return EmbeddedGrasp(f"thing {trial // 2}", seen, 8, 5)
+        return EmbeddedGrasp(f"object {trial // 2}", seen, 8, 5)
 
     result = judge_cost([grasp(trial) for trial in range(4)])
     assert result["delays"] == [0] * 4 and result["near"] == 1
-    assert result["auc"] == 1 and set(result["auc_of_pairs"]) == {"thing 0", "thing 1"}
+    assert result["auc"] == 1 and set(result["auc_of_pairs"]) == {"object 0", "object 1"}
     assert "within 3 frames in 100 % of 4 pairs" in cost_table(result, "ours")
 
 
-def test_things_grasped_once_have_forces_and_no_cost(tmp_path: Path) -> None:
+def test_objects_grasped_once_have_forces_and_no_cost(tmp_path: Path) -> None:
     """There is no other grasp whose end could be the goal."""
     table = ["trial,object"]
-    for thing in range(3):
-        table.append(f"grasp_{thing},thing_{thing}")
-        frames = press(thing, 40)
-        write_video(tmp_path / f"grasp_{thing}.avi", frames, 25)
+    for obj in range(3):
+        table.append(f"grasp_{obj},object_{obj}")
+        frames = press(obj, 40)
+        write_video(tmp_path / f"grasp_{obj}.avi", frames, 25)
         rows = [f"{0.5 * max(i - 5, 0)},0.04" for i in range(40)]
         text = "\n".join(["force_newtons,gripper_width_m", *rows])
-        (tmp_path / f"grasp_{thing}.csv").write_text(text)
+        (tmp_path / f"grasp_{obj}.csv").write_text(text)
     (tmp_path / "grasps.csv").write_text("\n".join(table))
     result = forces.run(forces.Config(data=tmp_path, encoders=("pixels",)))
     assert result["cost"] == {} and result["objects"] == 3
 
 
-def test_videos_of_other_things_tell_what_differs_without_meaning() -> None:
-    """Thirty things by 38 numbers, beside two that are larger and differ from video to video."""
+def test_videos_of_other_objects_tell_what_differs_without_meaning() -> None:
+    """Thirty objects by 38 numbers, beside two that are larger and differ from video to video."""
     rng = np.random.default_rng(0)
-    things = np.repeat(np.arange(30), 4)
-    kind = rng.normal(size=(30, 38))[things]
+    objects = np.repeat(np.arange(30), 4)
+    kind = rng.normal(size=(30, 38))[objects]
     embeddings = np.hstack([kind, rng.normal(5, 10, (120, 2))])
     plain, adapted = (
-        judge(embeddings, things).mean() for judge in (nearest_is_same, adapted_nearest_is_same)
+        judge(embeddings, objects).mean() for judge in (nearest_is_same, adapted_nearest_is_same)
     )
     assert plain < 0.6 and adapted > 0.9
-    shuffled = rng.permutation(things)  # nothing to learn: no better than chance
+    shuffled = rng.permutation(objects)  # noobject to learn: no better than chance
     assert adapted_nearest_is_same(embeddings, shuffled).mean() < 0.15
 
 
@@ -292,11 +292,11 @@ def test_markers_are_compared_with_another_trackers(tmp_path: Path) -> None:
     y, x = np.mgrid[40:200:40, 40:280:40].astype(float)
     for i, shift in enumerate((0.0, 4.0, -3.0, 5.5)):
         cv2.imwrite(str(tmp_path / f"gel_{i}.png"), dotted_picture(shift))
-        told = x + shift + 0.5  # where its first pixel lies is its own affair
-        told[:, 2] += shift
+        tracked = x + shift + 0.5  # where its first pixel lies is its own affair
+        tracked[:, 2] += shift
         if i == 3:
-            told[0, 0] += 5  # here the other one is wrong
-        tables = [x, y, told, y + 0.5, np.arange(24).reshape(4, 6)]
+            tracked[0, 0] += 5  # here the other one is wrong
+        tables = [x, y, tracked, y + 0.5, np.arange(24).reshape(4, 6)]
         (tmp_path / f"gel_{i}.json").write_text(json.dumps([t.tolist() for t in tables]))
     result = markers.run(markers.Config(data=tmp_path))
     assert result["dots"] == 3 * 24 and result["exchanged"] == result["lost"] == 0

@@ -58,10 +58,10 @@ def test_the_loss_of_views_is_that_of_the_paper() -> None:
     center, images = model.center.clone(), stack_frames(touch.float(), model.backbone.config.vit)
     views = [*drawn["global_ids"].unbind(1), *drawn["local_ids"].unbind(1)]
     assert len(views) == 2 + 3
-    losses, said = [], []
+    losses, scores = [], []
     for i in range(2):
         teacher = model.teacher_head(model.teacher.embed_touch(images, views[i]))
-        said.append(teacher)
+        scores.append(teacher)
         P = F.softmax((teacher - center) / 0.04, dim=1)
         for j, view in enumerate(views):
             if i != j:
@@ -69,9 +69,9 @@ def test_the_loss_of_views_is_that_of_the_paper() -> None:
                 losses.append(-(P * student.log_softmax(1)).sum(1).mean())
     terms = model(touch=touch, **drawn)
     torch.testing.assert_close(terms["loss"], torch.stack(losses).mean())
-    torch.testing.assert_close(model.center, 0.9 * center + 0.1 * torch.cat(said).mean(0))
+    torch.testing.assert_close(model.center, 0.9 * center + 0.1 * torch.cat(scores).mean(0))
     model.eval()(touch=touch, **drawn)
-    torch.testing.assert_close(model.center, 0.9 * center + 0.1 * torch.cat(said).mean(0))
+    torch.testing.assert_close(model.center, 0.9 * center + 0.1 * torch.cat(scores).mean(0))
 
 
 @pytest.mark.parametrize("reads", ["mean", "register"])

@@ -206,9 +206,11 @@ def test_metrics_are_what_they_are_called() -> None:
     assert metrics["rmse_mn_by_axis"] == pytest.approx([3, 4, np.sqrt(18)])
     assert metrics["mae_mn"] == pytest.approx(20 / 6)
     assert metrics["rmse_mn"] == pytest.approx(np.sqrt((9 + 16 + 9 + 16 + 36) / 6))
-    truth, said = np.array([1, 1, 0, 0, 1], bool), np.array([1, 0, 1, 0, 1], bool)
-    assert f1_score(said, truth) == pytest.approx(2 / 3)
-    assert slip_metrics(np.stack([said, truth]), truth, np.arange(5))["f1"] == pytest.approx(5 / 6)
+    truth, predicted = np.array([1, 1, 0, 0, 1], bool), np.array([1, 0, 1, 0, 1], bool)
+    assert f1_score(predicted, truth) == pytest.approx(2 / 3)
+    assert slip_metrics(np.stack([predicted, truth]), truth, np.arange(5))["f1"] == pytest.approx(
+        5 / 6
+    )
 
 
 def test_test_strokes_are_not_learned_from() -> None:

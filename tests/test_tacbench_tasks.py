@@ -133,8 +133,8 @@ def test_a_dense_probe_puts_values_where_they_belong() -> None:
 
 
 def test_metrics_of_labels_and_fields_by_hand() -> None:
-    truth, said = np.array([0, 0, 0, 1]), np.array([[0, 0, 1, 1], [0, 0, 0, 0]])
-    metrics = label_metrics(said, truth, np.arange(4))
+    truth, predicted = np.array([0, 0, 0, 1]), np.array([[0, 0, 1, 1], [0, 0, 0, 0]])
+    metrics = label_metrics(predicted, truth, np.arange(4))
     assert metrics["accuracy"] == pytest.approx(6 / 8)
     assert metrics["balanced_accuracy"] == pytest.approx((5 / 6 + 1 / 2) / 2)
     field = np.zeros((2, 3, 24, 24))

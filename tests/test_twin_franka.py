@@ -87,13 +87,13 @@ def moves(address: str, home: list[float]) -> dict:
 @pytest.mark.realtime
 def test_franka_holds_clients_to_its_limits(fr3: RunningTwin) -> None:
     fr3.begin("reset 3")
-    said = through_franky(moves, fr3)
-    assert "joint_motion_generator" in said["panda"] and "discontinuity" in said["panda"]
-    assert "joint_motion_generator_" in said["far"] and "limits_violation" in said["far"]
-    assert max(said["errors"]) < 2e-3
-    np.testing.assert_allclose(said["fell"], [0, 0, 0.03], atol=2e-3)
-    assert 0.05 < said["turned"][0] < 0.07 and np.abs(said["turned"][1:]).max() < 3e-3
-    assert said["held"] < 0.02
+    result = through_franky(moves, fr3)
+    assert "joint_motion_generator" in result["panda"] and "discontinuity" in result["panda"]
+    assert "joint_motion_generator_" in result["far"] and "limits_violation" in result["far"]
+    assert max(result["errors"]) < 2e-3
+    np.testing.assert_allclose(result["fell"], [0, 0, 0.03], atol=2e-3)
+    assert 0.05 < result["turned"][0] < 0.07 and np.abs(result["turned"][1:]).max() < 3e-3
+    assert result["held"] < 0.02
     worst = fr3.ask("truth")["worst"]
     assert worst["excess"] <= 0 and worst["speed"] < 1
 
@@ -143,16 +143,16 @@ def test_franka_grasps_what_is_there(fr3: RunningTwin) -> None:
     fr3.begin('reset 3 {"object": "wooden_block", "mass": 0.1}')
     pose = fr3.ask("truth")["layout"]["object"]
     position = [*pose[:2], max(pose[2], 0.0185)]
-    said = through_franky(picks, fr3, position, yaw_of(pose))
-    assert not said["air"] and said["opened"] and said["grasped"]
-    grasped, width, fault = said["met"]
-    assert grasped and abs(width - said["width"]) < 2e-3 and fault == ""
+    result = through_franky(picks, fr3, position, yaw_of(pose))
+    assert not result["air"] and result["opened"] and result["grasped"]
+    grasped, width, fault = result["met"]
+    assert grasped and abs(width - result["width"]) < 2e-3 and fault == ""
     truth = fr3.ask("truth")
     assert truth["layout"]["object"][2] > 0.1
     np.testing.assert_allclose(truth["pad_forces"], 20.0, rtol=0.05)
-    assert abs(truth["width"] - said["width"]) < 1e-4
-    assert abs(said["force"][2] - 0.1 * 9.81) < 0.1  # the robot holds it up: the maker's sign
-    assert said["took"] > 0.5 * (0.08 - said["width"]) / 0.04  # it keeps to the speed asked for
+    assert abs(truth["width"] - result["width"]) < 1e-4
+    assert abs(result["force"][2] - 0.1 * 9.81) < 0.1  # the robot holds it up: the maker's sign
+    assert result["took"] > 0.5 * (0.08 - result["width"]) / 0.04  # it keeps to the speed asked for
 
 
 def suffers(address: str, home: list[float]) -> dict:
@@ -161,11 +161,11 @@ def suffers(address: str, home: list[float]) -> dict:
 
     robot = connect(address)
     robot.set_collision_behavior([20.0] * 7, [20.0] * 6)
-    said, speed = "", [0.05, 0, 0, 0, 0, 0, 0]
+    error_message, speed = "", [0.05, 0, 0, 0, 0, 0, 0]
     try:
         robot.move(franky.JointVelocityMotion(speed, franky.Duration(20_000)))
     except franky.ControlException as error:
-        said = str(error)
+        error_message = str(error)
     mode = robot.state.robot_mode.name
     try:
         robot.move(franky.JointVelocityMotion(speed, franky.Duration(100)))
@@ -179,7 +179,7 @@ def suffers(address: str, home: list[float]) -> dict:
     if recovered:
         robot.relative_dynamics_factor = 0.5
         robot.move(franky.JointMotion(home))
-    return {"said": said, "mode": mode, "rejected": rejected, "recovered": recovered}
+    return {"error": error_message, "mode": mode, "rejected": rejected, "recovered": recovered}
 
 
 @pytest.mark.realtime
@@ -201,8 +201,8 @@ def test_franka_stops_for_a_fault(
         while fr3.ask("truth")["rest"] > 0 and not running.done():
             time.sleep(0.02)
         fr3.ask(fault)
-        said = running.result()
+        result = running.result()
     fr3.ask("stop-button off")
-    assert error in said["said"] and said["mode"] == mode
-    assert "rejected" in said["rejected"] and said["recovered"] == recovers
+    assert error in result["error"] and result["mode"] == mode
+    assert "rejected" in result["rejected"] and result["recovered"] == recovers
     assert fr3.at_rest()["worst"]["excess"] <= 0

@@ -21,18 +21,18 @@ def drives(address: str) -> dict:
         return np.array(receive.getActualQ())
 
     start = at()
-    said: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     control.moveJ((start + 0.2).tolist(), 1.0, 2.0)
-    said["move"] = float(np.abs(at() - start - 0.2).max())
+    result["move"] = float(np.abs(at() - start - 0.2).max())
     control.moveJ((start - 0.4).tolist(), 0.5, 2.0, True)
     time.sleep(0.4)
     control.stopJ(5.0)
     stopped = at()
     time.sleep(0.2)
-    said["stop"] = float(np.abs(at() - stopped).max())
-    said["short"] = float(np.abs(at() - start + 0.4).max())
+    result["stop"] = float(np.abs(at() - stopped).max())
+    result["short"] = float(np.abs(at() - start + 0.4).max())
     control.moveJ(start.tolist(), 1.0, 2.0)
-    said["servo"] = []
+    result["servo"] = []
     for rate in (20, 125, 500):
         began, worst, taken = time.monotonic(), 0.0, True
         while (now := time.monotonic() - began) < 0.8:
@@ -42,28 +42,28 @@ def drives(address: str) -> dict:
             worst = max(worst, abs(at()[0] - goal[0]))
             time.sleep(max(0.0, 1 / rate - (time.monotonic() - began - now)))
         control.servoStop()
-        said["servo"].append([taken, worst])
+        result["servo"].append([taken, worst])
     control.moveJ(start.tolist(), 1.0, 2.0)
     pose = receive.getActualTCPPose()
     control.moveL([*pose[:2], pose[2] - 0.05, *pose[3:]], 0.2, 0.5)
-    said["line"] = (np.array(receive.getActualTCPPose())[:3] - pose[:3]).tolist()
+    result["line"] = (np.array(receive.getActualTCPPose())[:3] - pose[:3]).tolist()
     control.setWatchdog(10)
     for _ in range(10):
         control.kickWatchdog()
         time.sleep(0.03)
-    said["kicked"] = control.isProgramRunning()
+    result["kicked"] = control.isProgramRunning()
     time.sleep(1.0)
-    said["silent"] = control.isProgramRunning()
-    return said
+    result["silent"] = control.isProgramRunning()
+    return result
 
 
 def test_ur_moves_servoes_and_watches(ur5e: RunningTwin) -> None:
-    said = client(drives, ur5e.cell.address)
-    assert said["move"] < 2e-3 and said["stop"] < 2e-3 and said["short"] > 0.1
-    for taken, worst in said["servo"]:
+    result = client(drives, ur5e.cell.address)
+    assert result["move"] < 2e-3 and result["stop"] < 2e-3 and result["short"] > 0.1
+    for taken, worst in result["servo"]:
         assert taken and worst < 0.1  # rad behind a goal at 0.2 rad/s, on a loaded machine
-    np.testing.assert_allclose(said["line"], [0, 0, -0.05], atol=2e-3)
-    assert said["kicked"] and not said["silent"]
+    np.testing.assert_allclose(result["line"], [0, 0, -0.05], atol=2e-3)
+    assert result["kicked"] and not result["silent"]
     assert ur5e.ask("truth")["worst"]["excess"] <= 0
 
 
@@ -85,28 +85,28 @@ def asks_too_much(address: str) -> dict:
             time.sleep(0.1)  # the news that the program runs has to come
 
     path = [[*(q + way).tolist(), 0.5, 0.5, 0.0] for way in (0.05, 0.1)]
-    said = {
+    result = {
         "path": refused(lambda: control.moveJ(path)),
         "jog": refused(lambda: control.jogStart([0.05, 0, 0, 0, 0, 0])),
         "contact": refused(lambda: control.moveUntilContact([0, 0, -0.05, 0, 0, 0])),
         "poses": refused(lambda: control.poseTrans([0.1] * 6, [0.1] * 6)),
         "moved": float(np.abs(np.array(receive.getActualQ()) - q).max()),
     }
-    said["goes on"] = control.moveJ((q + 0.05).tolist(), 1.0, 1.0)
-    said["short"] = float(np.abs(np.array(receive.getActualQ()) - q - 0.05).max())
+    result["goes on"] = control.moveJ((q + 0.05).tolist(), 1.0, 1.0)
+    result["short"] = float(np.abs(np.array(receive.getActualQ()) - q - 0.05).max())
     control.directTorque([5.0, 0, 0, 0, 0, 0])  # True whatever happens
     time.sleep(0.3)
-    said["torque"] = receive.isProtectiveStopped()
-    said["gone"] = float(np.abs(np.array(receive.getActualQ()) - q - 0.05).max())
-    return said
+    result["torque"] = receive.isProtectiveStopped()
+    result["gone"] = float(np.abs(np.array(receive.getActualQ()) - q - 0.05).max())
+    return result
 
 
 def test_ur_refuses_what_it_does_not_simulate_and_goes_on(ur5e: RunningTwin) -> None:
-    said = client(asks_too_much, ur5e.cell.address)
-    assert said["path"] and said["jog"] and said["contact"] and said["poses"]
-    assert said["moved"] < 2e-3
-    assert said["goes on"] and said["short"] < 2e-3
-    assert said["torque"] and said["gone"] < 2e-3
+    result = client(asks_too_much, ur5e.cell.address)
+    assert result["path"] and result["jog"] and result["contact"] and result["poses"]
+    assert result["moved"] < 2e-3
+    assert result["goes on"] and result["short"] < 2e-3
+    assert result["torque"] and result["gone"] < 2e-3
     ur5e.begin("reset 3")  # which clears the protective stop
 
 
@@ -149,15 +149,15 @@ def places(address: str, port: str, pick: list[float], place: list[float], yaw: 
         pose = [position[0], position[1], position[2] + height, *down]
         control.moveL(pose, speed, 1.0)
 
-    said = {"air": grip(3)}
+    result = {"air": grip(3)}
     go(pick, 0.12, 0.5)
     go(pick, 0.0, 0.2)
-    said["object"] = grip(230)
+    result["object"] = grip(230)
     go(pick, 0.12, 0.3)
     go(place, 0.12, 0.3)
     go(place, 0.0, 0.1)
     time.sleep(1.0)
-    return said
+    return result
 
 
 def test_ur_picks_and_places(ur5e: RunningTwin) -> None:
@@ -165,9 +165,9 @@ def test_ur_picks_and_places(ur5e: RunningTwin) -> None:
     layout = ur5e.ask("truth")["layout"]
     height = max(layout["object"][2], 0.0185)
     pick, place = [*layout["object"][:2], height], [*layout["goal"], height]
-    said = client(
+    result = client(
         places, ur5e.cell.address, ur5e.cell.gripper.port, pick, place, yaw_of(layout["object"])
     )
-    assert said == {"air": 3, "object": 2}
+    assert result == {"air": 3, "object": 2}
     truth = ur5e.ask("truth")
     assert truth["success"] and truth["progress"] == 1

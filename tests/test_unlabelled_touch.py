@@ -205,12 +205,12 @@ def test_a_policy_feels_what_its_training_did(vit: ViTConfig, real_time: bool) -
     """Also between plans, when nobody asks: the past is what was observed, not what was embedded."""
     touch, ticks = TouchEmbedder(backbone(vit), "toy"), toy_observations(14)
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=4)
-    planner, felt = LearnedPolicy(PolicyNetwork(config).eval(), touch), {}
+    planner, embedded = LearnedPolicy(PolicyNetwork(config).eval(), touch), {}
     embed = planner._embed_touch
 
     def watched(history):
         rows = embed(history)
-        felt[float(history[-1][ft.STATE][0])] = rows
+        embedded[float(history[-1][ft.STATE][0])] = rows
         return rows
 
     planner._embed_touch = watched
@@ -223,6 +223,6 @@ def test_a_policy_feels_what_its_training_did(vit: ViTConfig, real_time: bool) -
     sides = [touch.encoder.embed_frames(frames[key], frames[key][0]) for key in ft.TACTILE]
     recorded = np.concatenate(sides, 1)
     known = {float(tick[ft.STATE][0]): i for i, tick in enumerate(ticks)}
-    assert len(felt) >= 6 and max(known[key] for key in felt) > 2 * STRIDE
-    for key, rows in felt.items():
+    assert len(embedded) >= 6 and max(known[key] for key in embedded) > 2 * STRIDE
+    for key, rows in embedded.items():
         np.testing.assert_allclose(rows, recorded[known[key]], atol=1e-5)

@@ -46,7 +46,7 @@ def test_a_gripper_that_falls_silent_holds_then_stops_the_arm() -> None:
 
 
 @pytest.mark.parametrize(
-    ("device", "values", "said"),
+    ("device", "values", "message"),
     [
         ("arm", {"velocity": np.full(7, NAN)}, "joint velocity not a number"),
         ("arm", {"torque": np.full(7, NAN)}, "joint torque not a number"),
@@ -54,11 +54,11 @@ def test_a_gripper_that_falls_silent_holds_then_stops_the_arm() -> None:
     ],
 )
 def test_what_is_not_a_number_stops_the_arm_and_never_reaches_the_record(
-    device: str, values: dict, said: str
+    device: str, values: dict, message: str
 ) -> None:
     cell = FakeCell()
     ending = cell.run(at(10, set_(getattr(cell, device), **values)), step=0.001)
-    assert ending.stopped and said in ending.reason and np.isfinite(ending.rest_seconds)
+    assert ending.stopped and message in ending.reason and np.isfinite(ending.rest_seconds)
     assert len(cell.log.rows) >= 10
     assert all(np.isfinite(value).all() for row in cell.log.rows for value in row.values())
 

@@ -30,4 +30,4 @@ HELD_OUT_OBJECTS = (
     "walnut",
     "clay_lump",
 )
-"""Objects that no unit and no value has seen: `benchmark reward-quality` judges on these."""
+"""Objects held out from every fit of units and values: `benchmark reward-quality` judges on these."""

@@ -75,8 +75,8 @@ class Ending:
     def __str__(self) -> str:
         if not self.stopped:
             return self.reason
-        seen = np.isfinite(self.rest_seconds)
-        rest = f"at rest after {self.rest_seconds:.2f} s" if seen else "NOT seen at rest"
+        rests = np.isfinite(self.rest_seconds)
+        rest = f"at rest after {self.rest_seconds:.2f} s" if rests else "NOT known to be at rest"
         return f"STOPPED: {self.reason}\n  the arm: {rest}\n  what to do: {self.advice}"
 
 

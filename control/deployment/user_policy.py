@@ -84,12 +84,12 @@ class CheckedPolicy:
             )
         return action
 
-    def embed(self, seen: Sequence[Observation]) -> None:
+    def embed(self, observations: Sequence[Observation]) -> None:
         """Do nothing: no work is done ahead."""
 
-    def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "1 a"]:
+    def plan(self, observations: Sequence[Observation]) -> Float32[np.ndarray, "1 a"]:
         """Return the action for the next tick as a plan."""
-        return self.act(seen[-1])[None]
+        return self.act(observations[-1])[None]
 
 
 @dataclass(frozen=True)

@@ -37,13 +37,13 @@ def smooth(time: float, seconds: float) -> float:
 
 def main(address: str) -> None:
     """All of it on one arm."""
-    said: dict[str, object] = {}
+    result: dict[str, object] = {}
     robot = lib.Robot(address, lib.RealtimeConfig.kIgnore)
     robot.automatic_error_recovery()
     robot.set_collision_behavior(*_THRESHOLDS)
     mode = lib.ControllerMode.JointImpedance
     state = robot.read_once()
-    said["gravity"] = float(np.abs(robot.load_model().gravity(state)).max())
+    result["gravity"] = float(np.abs(robot.load_model().gravity(state)).max())
 
     def position(time: float, state: lib.RobotState) -> lib.JointPositions:
         del state
@@ -51,7 +51,7 @@ def main(address: str) -> None:
 
     start = np.array(state.q_d)
     run(robot.start_joint_position_control(mode), 2.0, position)
-    said["position"] = (np.array(robot.read_once().q) - start).tolist()
+    result["position"] = (np.array(robot.read_once().q) - start).tolist()
 
     def velocity(time: float, state: lib.RobotState) -> lib.JointVelocities:
         del state
@@ -59,7 +59,7 @@ def main(address: str) -> None:
 
     before = np.array(robot.read_once().q)
     run(robot.start_joint_velocity_control(mode), 1.0, velocity)
-    said["velocity"] = (np.array(robot.read_once().q) - before).tolist()
+    result["velocity"] = (np.array(robot.read_once().q) - before).tolist()
 
     model = robot.load_model()
 
@@ -70,7 +70,7 @@ def main(address: str) -> None:
 
     hold = np.array(robot.read_once().q)
     run(robot.start_torque_control(), 2.0, torque)
-    said["torque"] = (np.array(robot.read_once().q) - hold).tolist()
+    result["torque"] = (np.array(robot.read_once().q) - hold).tolist()
 
     try:  # a jump that no arm can follow
         run(
@@ -78,14 +78,14 @@ def main(address: str) -> None:
             1.0,
             lambda time, state: lib.JointPositions((np.array(state.q_d) + 0.2).tolist()),
         )
-        said["error"] = ""
+        result["error"] = ""
     except lib.ControlException as error:
-        said["error"] = str(error)
+        result["error"] = str(error)
     robot.automatic_error_recovery()
     start = np.array(robot.read_once().q_d)
     run(robot.start_joint_position_control(mode), 2.0, position)
-    said["recovered"] = (np.array(robot.read_once().q) - start).tolist()
-    print(json.dumps(said))
+    result["recovered"] = (np.array(robot.read_once().q) - start).tolist()
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

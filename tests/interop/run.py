@@ -32,15 +32,15 @@ def near(value: Any, expected: Any, tolerance: float = _TOLERANCE) -> bool:
     return bool(np.allclose(value, expected, atol=tolerance))
 
 
-def check_pylibfranka(said: dict[str, Any]) -> dict[str, bool]:
+def check_pylibfranka(result: dict[str, Any]) -> dict[str, bool]:
     """Commanded: 0.1 rad, -0.1 rad (an integral of sin squared), 0.05 rad, and 0.1 rad again."""
     return {
-        "gravity is felt": said["gravity"] > 5,
-        "positions": near(said["position"], 0.1),
-        "velocities": near(said["velocity"], -0.1),
-        "torques": near(said["torque"], 0.05, 0.03),
-        "a jump is refused": "discontinuity" in said["error"] or "violation" in said["error"],
-        "recovery": near(said["recovered"], 0.1),
+        "gravity is felt": result["gravity"] > 5,
+        "positions": near(result["position"], 0.1),
+        "velocities": near(result["velocity"], -0.1),
+        "torques": near(result["torque"], 0.05, 0.03),
+        "a jump is refused": "discontinuity" in result["error"] or "violation" in result["error"],
+        "recovery": near(result["recovered"], 0.1),
     }
 
 
@@ -61,17 +61,17 @@ def run_pylibfranka(number: int) -> bool:
     if done.returncode != 0:
         print(f"pylibfranka: it failed: {done.stderr.strip().splitlines()[-1:]}", flush=True)
         return False
-    said = json.loads(done.stdout.splitlines()[-1])
-    return report("pylibfranka", check_pylibfranka(said), str(said))
+    result = json.loads(done.stdout.splitlines()[-1])
+    return report("pylibfranka", check_pylibfranka(result), str(result))
 
 
-def report(name: str, found: dict[str, bool], said: str) -> bool:
+def report(name: str, found: dict[str, bool], result: str) -> bool:
     """Print what was found; whether all is as it should be."""
     print(
         f"{name}: " + ", ".join(f"{what} {'ok' if ok else 'WRONG'}" for what, ok in found.items())
     )
     if not all(found.values()):
-        print(f"  {said}", flush=True)
+        print(f"  {result}", flush=True)
     return all(found.values())
 
 
