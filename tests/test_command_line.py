@@ -1,9 +1,7 @@
 """What every command shares: help, options, one line for a mistake, the run's folder, Ctrl-C."""
 
-import dataclasses
 import json
 import os
-import pickle
 import re
 import signal
 import subprocess
@@ -339,18 +337,6 @@ def test_a_value_out_of_range_is_one_line(
     with pytest.raises(OptionError, match=f"^{config.__name__}: {message}") as refused:
         config(**values)
     assert "\n" not in str(refused.value)
-
-
-def test_a_config_is_a_plain_frozen_dataclass() -> None:
-    config = PickPlaceConfig(mass=(1, 2), max_seconds=3)
-    assert config.mass == (1.0, 2.0) and isinstance(config.max_seconds, float)
-    assert pickle.loads(pickle.dumps(config)) == config and hash(config)
-    assert dataclasses.replace(config, tolerance=0.1).mass == config.mass
-    assert dataclasses.asdict(config)["randomization"]["gain"] == 0.047
-    with pytest.raises(OptionError):
-        dataclasses.replace(config, tolerance=-0.1)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        config.tolerance = 1.0  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_named_wires_are_taken_in_turn() -> None:

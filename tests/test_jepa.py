@@ -11,7 +11,6 @@ from toy_touches import moving_blobs
 
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.sparsh import Method, backbone_for, vit_for
-from touchgoal.encoders.backbones.vit import ViT
 from touchgoal.encoders.ssl.config import (
     IJEPA_PRESETS,
     VJEPA_PRESETS,
@@ -171,22 +170,13 @@ def test_paper_presets_are_table_2() -> None:
 
 
 @pytest.mark.parametrize(
-    "method, image_size, backbone_size, paper, predictor_size",
+    "method, paper, size",
     [
-        ("ijepa", (224, 224), 86_386_944, IJEPA_PRESETS["paper"], 2_967_936 - 2 * 6 * 192),
-        ("vjepa", (224, 224), 86_537_472, VJEPA_PRESETS["paper"], 21_894_912 - 2 * 12 * 384),
+        ("ijepa", IJEPA_PRESETS["paper"], 2_967_936 - 2 * 6 * 192),
+        ("vjepa", VJEPA_PRESETS["paper"], 21_894_912 - 2 * 12 * 384),
     ],
 )
-def test_sizes_are_the_published_ones(
-    method: Method,
-    image_size: tuple[int, int],
-    backbone_size: int,
-    paper: PredictorConfig,
-    predictor_size: int,
-) -> None:
+def test_sizes_are_the_published_ones(method: Method, paper: PredictorConfig, size: int) -> None:
     """The released predictors have LayerScale besides, two factors a block and channel."""
-    vit = vit_for(method, "base", image_size)
-    with torch.device("meta"):
-        backbone = ViT(vit)
-    assert sum(p.numel() for p in backbone.parameters()) == backbone_size
-    assert sum(p.numel() for p in Predictor(vit, paper).parameters()) == predictor_size
+    vit = vit_for(method, "base", (224, 224))
+    assert sum(p.numel() for p in Predictor(vit, paper).parameters()) == size

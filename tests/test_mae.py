@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from interrupted_training import killed_in_epoch
+from toy_touches import SENSOR, moving_blobs
 
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.vit import patchify, random_masking
@@ -18,21 +19,13 @@ from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.runtime.errors import UserError
 
-SENSOR = "gelsight_mini_markers"
 TOY = MaeConfig(vit="tiny", decoder_width=16, decoder_depth=1, epochs=3, batch_size=16, lr=3e-3)
 
 
 def blobs(count: int, seed: int) -> TouchFrames:
-    """Round contacts somewhere on the gel; the "force" says where and how strong."""
-    rng = np.random.default_rng(seed)
-    y, x = np.mgrid[:120, :160]
-    place = rng.uniform((30, 30), (90, 130), (count, 2))
-    strength = rng.uniform(1, 4, count)
-    distance2 = (y - place[:, 0, None, None]) ** 2 + (x - place[:, 1, None, None]) ** 2
-    blob = strength[:, None, None] * np.exp(-distance2 / 20**2)
-    touch = torch.from_numpy(np.repeat(blob[:, None], 3, 1)).half()
-    wrench = np.column_stack([place / 100, strength, np.zeros((count, 3))])
-    return TouchFrames(touch, torch.from_numpy(wrench).float(), SENSOR)
+    """Round contacts in single frames."""
+    moving = moving_blobs(count, seed, frames=1)
+    return replace(moving, touch=moving.touch[:, 0], stride=1)
 
 
 def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> None:
@@ -51,9 +44,6 @@ def test_the_paper_preset_is_table_2() -> None:
     assert (paper.lr, paper.batch_size, paper.epochs) == (1e-4, 100, 150)
     assert (paper.weight_decay, paper.final_weight_decay) == (0.04, 0.4)
     assert paper.warmup * paper.epochs == 30 and not paper.bottleneck
-    with torch.device("meta"):
-        backbone = MaskedAutoencoder(paper, SENSOR, 2).backbone
-    assert sum(p.numel() for p in backbone.vit.parameters()) == 86_254_848
 
 
 @pytest.mark.parametrize("bottleneck", [True, False])

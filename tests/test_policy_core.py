@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 from toy_policies import (
     DIFFUSION,
     FLOW,
@@ -257,14 +256,8 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no policy in"):
         checkpoint.load(tmp_path)
     checkpoint.save(PolicyNetwork(TOY), tmp_path, {})
-    weights, path = load_file(tmp_path / "policy.safetensors"), tmp_path / "policy.json"
-    save_file(weights | {"read.4.bias": torch.zeros(9)}, tmp_path / "policy.safetensors")
-    with pytest.raises(UserError, match="read.4.bias is"):
-        checkpoint.load(tmp_path)
+    path = tmp_path / "policy.json"
     description = json.loads(path.read_text())
-    path.write_text(json.dumps(description | {"format": 99}))
-    with pytest.raises(UserError, match="format 99"):
-        checkpoint.load(tmp_path)
     del description["config"]["head"]
     path.write_text(json.dumps(description))
     with pytest.raises(UserError, match="damaged"):

@@ -20,9 +20,8 @@ from touchgoal.encoders.alignment.green_screen import (
 from touchgoal.episodes import wand_recording
 from touchgoal.episodes.wand_recording import record_touches
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.scene.build import OBJECT_GROUP
 from touchgoal.sim_envs.touch_wand import Touch, TouchWand
-from touchgoal.sim_envs.wand.bench import GREEN, VIEWS, Bench
+from touchgoal.sim_envs.wand.bench import GREEN, VIEWS
 from touchgoal.sim_envs.wand.objects import find_wand_object, wand_objects
 
 SEEN = ("apple", "cucumber", "wine_glass", "rice")  # one of them as green as the screen
@@ -47,19 +46,6 @@ def test_the_catalogue_is_the_papers() -> None:
     assert all(3 <= len(o.descriptions) <= 5 and o.mass > 0 for o in objects.values())
     with pytest.raises(UserError, match="unknown object 'pear'; choose from: apple, "):
         find_wand_object("pear")
-
-
-def test_objects_stand_on_the_bench() -> None:
-    for item in list(wand_objects().values())[::3]:
-        bench = Bench(item, (16, 16))
-        geoms = [g for g in range(bench.model.ngeom) if bench.model.geom_group[g] == OBJECT_GROUP]
-        assert 1 < len(geoms) <= 61 and bench.radius < 0.2, item.name
-        lowest = min(
-            _lowest(bench.model, bench.data, g)
-            for g in geoms
-            if bench.model.geom(g).name != "bench"
-        )
-        assert -0.004 < lowest < 0.002, item.name
 
 
 def test_gymnasium_contract() -> None:
@@ -121,26 +107,6 @@ def test_the_green_screen_is_cut_out(name: str) -> None:
         change(covered)
     change(touch.views["top"])  # now the screen's colour is known
     np.testing.assert_array_equal(change(covered), covered)
-
-
-def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Return the lowest point of a geom, m."""
-    mesh = int(model.geom_dataid[geom])
-    down = data.geom_xmat[geom].reshape(3, 3)[2]
-    if mesh >= 0:
-        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        reach = (model.mesh_vert[first : first + count] @ down).min()
-    else:
-        reach = -model.geom_rbound[geom]
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
-            reach = -np.abs(down) @ model.geom_size[geom]
-        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER:
-            radius, half = model.geom_size[geom][:2]
-            reach = -abs(down[2]) * half - np.hypot(down[0], down[1]) * radius
-        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
-            radius, half = model.geom_size[geom][:2]
-            reach = -abs(down[2]) * half - radius
-    return float(data.geom_xpos[geom][2] + reach)
 
 
 def _is_screen(model: mujoco.MjModel, geom: int) -> bool:

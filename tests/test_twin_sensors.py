@@ -18,7 +18,6 @@ from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.twin.mjpeg import Stream
-from touchgoal.sim_envs.twin.pace import Pace
 
 
 @pytest.mark.parametrize("arm", ["fr3", "ur5e"])
@@ -128,25 +127,6 @@ def test_mistakes_say_what_to_do(fr3: RunningTwin) -> None:
         fr3.ask('reset 0 {"object": "teapot"}')
     with pytest.raises(UserError, match="no twin answers at 127.0.0.1:9"):
         twin_client.ask_twin("127.0.0.1:9", "truth")
-
-
-def test_pace_is_of_whole_seconds_in_which_a_client_drives(monkeypatch: pytest.MonkeyPatch) -> None:
-    wall = [0.0]
-    monkeypatch.setattr("time.monotonic", lambda: wall[0])
-    pace = Pace()
-    for driven, steps, slowness in (
-        (False, 3000, 5),
-        (True, 2001, 2),
-        (False, 1, 9),
-        (True, 999, 9),
-    ):
-        for _ in range(steps):
-            wall[0] += slowness * 1e-3
-            pace.count_step(driven, wall[0] / 10)
-    numbers = pace.summary()
-    assert numbers["seconds"] == 2
-    assert numbers["pace_median"] == pytest.approx(0.5) == numbers["pace_slowest"]
-    assert numbers["processor_pictures"] == pytest.approx(0.2)
 
 
 def test_streams_that_have_sent_as_many_pictures_are_told_apart() -> None:
