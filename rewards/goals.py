@@ -167,7 +167,7 @@ class GoalFile:
 
 @dataclass(frozen=True)
 class Sentence:
-    """How the object feels, in words. Sentence encoders hardly see a "not": say what is there.
+    """Description of how the object feels. Sentence encoders hardly notice a "not": say what is there.
 
     With a baseline sentence, such as "an object", only the direction from it to the sentence counts
     (VLM-RM, arXiv 2310.12921): see `distance.embedding_distance.text_distances`.

@@ -34,7 +34,7 @@ _LOWEST = 0.018  # m: lowest height of the pads' middle above the table
 
 @dataclass(frozen=True, eq=False)
 class GraspAttempt:
-    """One attempt."""
+    """One attempt to grip and lift an object."""
 
     # left, right: the fingertips' pictures at `MOMENTS`, RGB
     left: UInt8[np.ndarray, "3 h w 3"]

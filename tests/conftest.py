@@ -33,7 +33,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """For what runs in real time alone, files without it are not read: that takes seconds."""
+    """With `-m realtime`, skip files without such tests: reading them all takes seconds."""
     alone = config.option.markexpr == "realtime" and collection_path.suffix == ".py"
     return True if alone and "realtime" not in collection_path.read_text() else None
 
@@ -64,7 +64,7 @@ def ur5e(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
 
 @pytest.fixture(scope="module")
 def recorded_small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A set of three toy episodes, which stays as it is."""
+    """A set of three toy episodes that no test changes."""
     root = tmp_path_factory.mktemp("small") / "episodes"
     record(root, range(3))
     return root
@@ -72,5 +72,5 @@ def recorded_small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small(recorded_small: Path, tmp_path: Path) -> Path:
-    """The same, to do with as one likes."""
+    """A copy of it that a test may change."""
     return shutil.copytree(recorded_small, tmp_path / "set")

@@ -75,7 +75,7 @@ class Command:
 
     @property
     def small(self) -> list[str]:
-        """Its words after `touchgoal`, at toy size."""
+        """Return the words after `touchgoal`, with options that make it small."""
         words = self.words[1:]
         name = next((n for n in TOY if words[: len(n.split())] == n.split()), None)
         for option in re.findall(r"--\S+(?: [^-]\S*)*", TOY[name]) if name else []:
@@ -89,7 +89,7 @@ class Command:
 
 
 def commands() -> Iterator[Command]:
-    """All of them, in the order in which a person meets them; each line once."""
+    """Yield each printed command once, in the order of the pages."""
     met = set()
     for page in PAGES:
         text = page.read_text()
@@ -100,7 +100,7 @@ def commands() -> Iterator[Command]:
 
 
 def exit_status(words: list[str]) -> int:
-    """What a command ends with, in a process that stays for the next one."""
+    """Run a command in this process and return its exit status."""
     print("touchgoal", shlex.join(words), flush=True)
     try:
         with in_process_workers():

@@ -15,7 +15,7 @@ from touchgoal.control.safety.limits import FR3
 
 @dataclass
 class FakeClock:
-    """Jumps where it is waited for."""
+    """A clock that jumps to the time that is waited for."""
 
     time: float = 0.0
 
@@ -31,7 +31,7 @@ class FakeClock:
 
 @dataclass
 class FakeArm:
-    """Is at once where it is commanded."""
+    """An arm that is at once where it is commanded."""
 
     clock: FakeClock
     reading: ArmReading = field(
@@ -57,7 +57,7 @@ class FakeArm:
 
 @dataclass
 class FakeGripper:
-    """Remembers its commands; `follows` them to an object of 40 mm, or stands still."""
+    """A gripper that records its commands; it `follows` them to an object of 40 mm, or stands still."""
 
     clock: FakeClock
     reading: GripperReading = field(default_factory=lambda: GripperReading(0.04, False, "", 0.0))
@@ -81,7 +81,7 @@ class FakeGripper:
 
 @dataclass
 class FakeCamera:
-    """Shows one picture, new each time."""
+    """A camera that shows one picture, new each time."""
 
     clock: FakeClock
     image: np.ndarray
@@ -96,7 +96,7 @@ class FakeCamera:
 
 @dataclass
 class FakeLoadCell:
-    """Says one force (N)."""
+    """A load cell that reads one force (N)."""
 
     clock: FakeClock
     force: float = 0.0
@@ -108,7 +108,7 @@ class FakeLoadCell:
 
 
 class FakeCell:
-    """Its devices, and a run of the control loop on them.
+    """Fake devices, and a run of the control loop on them.
 
     Attributes:
         log: what the last run recorded.

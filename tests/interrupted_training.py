@@ -10,7 +10,7 @@ from touchgoal.encoders.training import trainer
 
 @contextmanager
 def killed_in_epoch(epoch: int) -> Iterator[None]:
-    """Whatever trains in this context is interrupted as that epoch begins, and must end by it."""
+    """Interrupt the training in this context as that epoch begins."""
     train_epoch: Callable = trainer._train_epoch
 
     def dies(*args):

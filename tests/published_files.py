@@ -22,7 +22,7 @@ def gel(seed: int, shape: tuple[int, int] = (320, 240), light: str = "red") -> n
 
 
 def encoded(picture: np.ndarray, kind: str = "JPEG") -> bytes:
-    """By PIL, which takes RGB."""
+    """Encode an RGB picture with PIL."""
     file = io.BytesIO()
     Image.fromarray(picture).save(file, kind, **({"quality": 95} if kind == "JPEG" else {}))
     return file.getvalue()
@@ -47,7 +47,7 @@ def write_slides(folder: Path, objects: tuple[str, ...] = ("004_sugar_box", "bre
 
 
 def near(picture: np.ndarray, true: np.ndarray) -> bool:
-    """As near as JPEG keeps it."""
+    """Return whether two pictures differ by no more than JPEG's loss."""
     return bool(np.abs(picture.astype(int) - true).mean() < 2)
 
 

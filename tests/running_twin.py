@@ -48,11 +48,11 @@ class RunningTwin:
         self.cell = read_cell_file(self.cell_file)
 
     def ask(self, line: str) -> dict[str, Any]:
-        """What the twin answers to an order or a question."""
+        """Send the twin a command and return its answer."""
         return twin_client.ask_twin(self.cell.task.twin, line)
 
     def at_rest(self) -> dict[str, Any]:
-        """The truth once the arm is at rest."""
+        """Wait until the arm rests; return the simulator's truth."""
         deadline = time.monotonic() + 60
         while (truth := self.ask("truth"))["rest"] < 0.1:
             assert time.monotonic() < deadline
@@ -65,7 +65,7 @@ class RunningTwin:
         self.ask(line)
 
     def close(self) -> None:
-        """Ctrl-C, which it ends well after."""
+        """End the twin by Ctrl-C."""
         self._process.send_signal(signal.SIGINT)
         try:
             self._process.wait(20)
@@ -75,7 +75,7 @@ class RunningTwin:
 
 
 def client(function: Callable, *arguments: object, using: Callable | None = None) -> dict[str, Any]:
-    """What a function, and one that it is `using`, returns in a process of its own."""
+    """Run a function in a process of its own, with the source of one that it is `using`."""
     source = "\n".join(inspect.getsource(part) for part in (using, function) if part)
     program = (
         f"import json, sys, time\nimport numpy as np\n{source}\n"

@@ -123,7 +123,7 @@ def test_one_tick_at_a_time_no_observation_is_planned_from_twice() -> None:
 
 
 def test_however_quick_the_machine_a_plan_is_done_from_the_tick_after_its_observation() -> None:
-    """So an arm does what was judged in simulation with plans that come a tick late."""
+    """Equals the simulation with plans that come a tick late."""
     touch = toy_touch_embedder()
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
     policy = toy_policy(config, toy_dataset(config)).eval()

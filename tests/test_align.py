@@ -36,7 +36,7 @@ CONFIG = AlignConfig(backbone="vit-tiny", embedding_dim=16, epochs=3, batch_size
 
 
 class FakeTowers:
-    """Pictures by their mean colour, sentences by their letters."""
+    """Towers that embed images by mean colour and sentences by their letters."""
 
     name = "fake"
 
@@ -284,7 +284,7 @@ def test_bad_directories_and_configs_are_refused(tmp_path: Path) -> None:
 
 
 def as_felt(view: torch.Tensor, label: torch.Tensor) -> tuple[TouchEncoder, TouchData]:
-    """One touch an episode, embedded as the view of its own episode; one sentence an object."""
+    """Return data in which each touch is embedded as its own episode's view."""
     n, names = len(view), ("a", "b")
     data = TouchData(
         touch=torch.zeros(n, 3, 1, 1).half(),

@@ -149,7 +149,7 @@ def test_taring_takes_the_bias() -> None:
 
 
 def test_a_policy_that_sees_commands_sees_no_delay() -> None:
-    """What it sees is where the arm was sent, in the plain environment and behind any delay."""
+    """Its input is the commanded pose, whatever the delay."""
     columns = (ft.STATE, ft.TCP_POSE, ft.COMMAND)
     late = {"state_delay": (0.1, 0.1), "command_delay": (0.1, 0.1)}
     actions = moving()

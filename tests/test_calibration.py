@@ -134,7 +134,7 @@ def test_calibrate_finds_known_lights(
 
 
 def test_presses_in_one_place_say_nothing_about_the_rest(presses: Path) -> None:
-    """The same pictures' middle ones, and no ball radius: fitted, without terms in position."""
+    """Presses in the middle, ball radius unknown: the fit leaves out terms in position."""
     together = read_presses(presses, PITCH)
     spread = np.hypot(*(together.circles[:, :2] - [80, 60]).T)
     middle = together.take(np.argsort(spread)[:8])
@@ -287,7 +287,7 @@ def test_a_sphere_is_read_from_a_depth_map() -> None:
 
 
 def test_a_background_is_filled_in_without_a_seam() -> None:
-    """Where presses lie on top of each other, the settled gel's change goes on from around them."""
+    """Under presses in one place the background is continued from around them."""
     made = made_presses(known_sensor(), 8)
     circles = np.tile([80.0, 60.0, 8.0], (8, 1))
     settled = (made.background.astype(int) + 6).astype(np.uint8)

@@ -93,7 +93,7 @@ def test_a_byte_order_mark_is_read_over(tmp_path: Path) -> None:
 
 
 def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
-    """What is written into its JSON by hand counts, or is refused."""
+    """Keys added by hand count or are refused."""
     cell = read_cell_file(write_cell_file(tmp_path, SIM))
     path, table = tmp_path / "cell.json", cell_table(cell)
     path.write_text(json.dumps(table))

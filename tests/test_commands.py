@@ -30,7 +30,7 @@ def run(*arguments: object) -> None:
 
 
 def refused(capsys: pytest.CaptureFixture, *arguments: object) -> str:
-    """The one line a command refuses with."""
+    """Run a command that must fail; return its one-line message."""
     with pytest.raises(SystemExit) as stopped:
         run(*arguments)
     message = stopped.value.code
@@ -51,7 +51,7 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def validation(episodes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same picks, with the arm elsewhere: no frame is shared."""
+    """The same picks with other joint positions, so that no frame is shared."""
     source, root = EpisodeSet(episodes), tmp_path_factory.mktemp("validation") / "episodes"
     writer = EpisodeWriter(root, source.fps)
     for i in range(len(source)):
@@ -145,7 +145,7 @@ def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
 def test_teleop_needs_a_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it does at one: test_teleop.py."""
+    """With a terminal: test_teleop.py."""
     out = tmp_path / "out"
     monkeypatch.setattr("sys.stdin", open(os.devnull))
     assert "in a terminal" in refused(capsys, "teleop", "--out", out)
@@ -157,7 +157,7 @@ def test_teleop_needs_a_terminal(
 def test_learning_the_bead_maze(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From demonstrations to a policy that runs; too little of everything to be any good."""
+    """The commands from demonstrations to a policy, at toy size."""
     monkeypatch.chdir(tmp_path)
     one = ("--workers", 1)
     record = ("collect-demos", "--task", "bead-maze", "--episodes", 1, "--env.cameras",
@@ -213,7 +213,7 @@ def test_learning_to_pick_and_place(
     capsys: pytest.CaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """From placements and demonstrations to a policy that is corrected; too little of everything."""
+    """The commands from placements to a corrected policy, at toy size."""
     monkeypatch.chdir(tmp_path)
     one, blind = ("--workers", 1), ("--env.no-tactile", "--env.cameras", "--out", "demos")
     copied = shutil.copytree(episodes, tmp_path / "copied")

@@ -42,7 +42,7 @@ def sensed(light: np.ndarray, bump: np.ndarray, seed: int = 0) -> np.ndarray:
 
 
 def through_jpeg(frame: np.ndarray) -> np.ndarray:
-    """As a sensor sends it, with noise of a size that its blocks make coarse."""
+    """Compress and decode a frame as a JPEG stream does."""
     decoded = cv2.imdecode(cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 60])[1], 1)
     assert decoded is not None
     return decoded
@@ -191,7 +191,7 @@ def test_wrenches_and_slip_are_mujocos() -> None:
 
 
 def _velocity(env: BeadMaze, geom: int, point: np.ndarray) -> np.ndarray:
-    """Of a point (m, world frame) fixed to a geom, m/s."""
+    """Return the velocity (m/s) of a point (m, world frame) fixed to a geom."""
     twist, body = np.zeros(6), env.model.geom_bodyid[geom]
     mujoco.mj_objectVelocity(env.model, env.data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
     return twist[3:] + np.cross(twist[:3], point - env.data.xpos[body])

@@ -59,7 +59,7 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
 
 
 def deploying(twin: RunningTwin, out: Path) -> "subprocess.Popen[str]":
-    """`touchgoal deploy --execute` as a person runs it: in here its types would be checked meanwhile."""
+    """Start `touchgoal deploy --execute` in a process, where types are not checked at run time."""
     command = [sys.executable, "-m", "touchgoal.launch", "deploy", str(twin.cell_file)]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([*command, "--execute", "--yes", "--out", str(out / "run")], **pipes)
@@ -242,7 +242,7 @@ def test_a_wrong_policy_of_ones_own_stops_the_arm_with_its_name(
 
 
 def test_an_interrupted_pipe_keeps_the_report_and_the_status(tmp_path: Path) -> None:
-    """As `deploy | tee log` and Ctrl-C, which ends tee, too; the keyboard is closed besides."""
+    """`deploy | tee log` and Ctrl-C, which also ends tee; standard input is closed."""
     cell = write_cell_file(tmp_path, SIM)
     command = f"exec {sys.executable} -m touchgoal.launch deploy {cell} --execute --yes <&-"
     process = subprocess.Popen(

@@ -119,7 +119,7 @@ def shell(desk: Path) -> Iterator[Shell]:
 
 @pytest.mark.slow
 def test_commands_run(shell: Shell) -> None:
-    """One after the other, as a person would who reads the pages from the first to the last."""
+    """All commands in the order of the pages."""
     for command in TYPED:
         if command not in DEPLOYING:
             assert shell(command.small) == 0, command

@@ -121,7 +121,7 @@ def test_step_before_reset_says_so() -> None:
 
 @pytest.mark.parametrize("context", ["fork", "forkserver"])
 def test_a_forked_worker_refuses_to_render(context: str) -> None:
-    """In Mesa it would wait for ever, if its parent has rendered."""
+    """In Mesa it would wait for ever if its parent has rendered."""
     program = f"""
 import gymnasium as gym, touchgoal
 

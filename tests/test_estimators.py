@@ -95,7 +95,6 @@ def test_contact_is_learnt(tmp_path: Path) -> None:
 
 
 def test_contact_is_true_or_false() -> None:
-    """As in what a policy learns on, however sure the network is."""
     estimator, observed = toy_estimator(), toy_observations(1)[0]
     observed |= {ft.FRONT: np.zeros((16, 16, 3), np.uint8)}
     contact = estimator.estimate(observed, observed)[ft.TRUTH_CONTACT]

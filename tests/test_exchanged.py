@@ -34,7 +34,7 @@ STARTS = 20
 
 
 def drifted(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """As on another day: brighter or darker, and by a smooth pattern (spreads of `background.py`)."""
+    """Change the light as between days: gain, offset and a smooth pattern (spreads of `background.py`)."""
     height = picture.shape[0]
     wave = np.cos(np.pi * rng.integers(1, 4) * np.arange(height) / height)[:, None, None]
     changed = picture * (1 + 0.047 * rng.normal(size=3)) + 2.4 * rng.normal(size=3)

@@ -19,7 +19,7 @@ SHAPE = GELSIGHT_WEDGE.image_shape
 
 
 def pinhole(x: np.ndarray, y: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where a camera beside the gel, turned about the gel's y axis by 40 degrees, sees a point of it, px."""
+    """Project a gel point (mm) to px in a camera turned by 40 degrees about the gel's y axis."""
     angle, distance = np.radians(40.0), 40.0  # mm to the gel's middle
     side, depth = (x - WIDE / 2) * np.cos(angle), distance + (x - WIDE / 2) * np.sin(angle)
     return scale * (320 + 500 * side / depth), scale * (240 + 500 * (y - HIGH / 2) / depth)

@@ -20,7 +20,7 @@ def look(instance: SensorInstance, rng: np.random.Generator) -> np.ndarray:
 def drawn(
     picture: np.ndarray, kind: str, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The picture with a scratch, a hole in the coating or a dust grain, and where (px)."""
+    """Draw a scratch, a hole in the coating or a dust grain; return the picture and the place (px)."""
     h, w, _ = picture.shape
     mask, at = np.zeros((h, w), np.uint8), rng.uniform([0.3 * w, 0.3 * h], [0.7 * w, 0.7 * h])
     middle = int(at[0]), int(at[1])

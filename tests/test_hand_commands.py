@@ -83,7 +83,7 @@ def connected(monkeypatch: pytest.MonkeyPatch, between: float) -> tuple[FrankaHa
 
 
 def driven(monkeypatch: pytest.MonkeyPatch, wanted: list[float], between: float) -> tuple:
-    """Widths (m, every ms) that the driver makes of these, one a look, and its commands to the hand."""
+    """Return the widths (m, every ms) for these targets, one a look, and the driver's commands."""
     client, hand = connected(monkeypatch, between)
     widths = []
     for width in wanted:
@@ -98,7 +98,7 @@ def driven(monkeypatch: pytest.MonkeyPatch, wanted: list[float], between: float)
 
 
 def simulated(wanted: list[float], between: float) -> np.ndarray:
-    """The same of the environment's hand."""
+    """Return the widths that the environment's hand makes of the same targets."""
     fingers, widths = Fingers(between), []
     hand = DeployedHand(fingers, np.random.default_rng(0))
     phase = int(np.random.default_rng(0).integers(LOOK))  # of its looks

@@ -74,7 +74,7 @@ def test_version_is_said_once() -> None:
 
 
 def test_every_data_file_is_packaged() -> None:
-    """What lies beside the code (weights, sensor files, cell files) is in the wheel, too."""
+    """Weights, sensor files and cell files are in the wheel."""
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
     packaged = {
         path.relative_to(ROOT)
@@ -99,7 +99,7 @@ def test_control_needs_no_torch() -> None:
 
 
 def test_the_robots_pc_needs_neither_torch_nor_mujoco() -> None:
-    """With both blocked the scripted plan and a user's policy run on a cell; the command parses."""
+    """With both blocked, the scripted plan and a user's policy run on a cell."""
     program = Path(__file__).parent / "without_torch_and_mujoco.py"
     subprocess.run([sys.executable, program], check=True, timeout=120)
 

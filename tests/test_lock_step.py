@@ -26,7 +26,7 @@ _SMALL = "--env.objects wooden_block --env.cameras front --env.camera-size 96 96
 
 
 def swing(cell: CellConfig, pause: float) -> list[np.ndarray]:
-    """What is read at each tick while the arm swings and the hand closes."""
+    """Return all readings of each tick while the arm swings and the hand closes."""
     put_scene_back(cell.task.twin, cell.task.seed)
     connection, seen = connect_cell(cell, ft.CONTROL_HZ), []
     q = connection.arm.read().q
@@ -46,7 +46,7 @@ def swing(cell: CellConfig, pause: float) -> list[np.ndarray]:
 
 @pytest.mark.slow
 def test_a_lock_step_twin_gives_the_same_run_to_the_last_bit(tmp_path: Path) -> None:
-    """Its time stands but while the deployment waits; afterwards it goes on by itself."""
+    """The twin's time advances only while the deployment waits."""
     pytest.importorskip("franky", reason=FRANKY.install)
     with closing(RunningTwin(["--lock-step", *_SMALL, "--seed", "3"], tmp_path, 4)) as twin:
         first = swing(twin.cell, 0.0)
@@ -63,7 +63,7 @@ def test_a_lock_step_twin_gives_the_same_run_to_the_last_bit(tmp_path: Path) -> 
 
 
 def _ages_of_a_frozen_camera(twin: RunningTwin) -> list[float]:
-    """How old (s, of the twin's time) its picture is: 0.5 s before it freezes, and 1 s later."""
+    """Return the picture's age (s, twin's time) before the camera freezes and 1 s later."""
     connection, ages = connect_cell(twin.cell, ft.CONTROL_HZ), []
     camera = connection.cameras[ft.FRONT]
     clock = connection.clock
@@ -94,7 +94,7 @@ def test_a_lock_step_cell_without_a_twin_is_one_line(address: str) -> None:
 
 @pytest.mark.slow
 def test_benchmark_deploy_counts_what_deploy_did(tmp_path: Path) -> None:
-    """From the maze's example file, without a twin; a wire is not led to its end within half a second."""
+    """The maze's example file, without a twin; half a second does not reach the wire's end."""
     run = "benchmark deploy --tasks bead-maze --policies scripted --episodes 1".split()
     main([*run, "--arms", "in-process", "--seconds", "0.5", "--out", str(tmp_path / "run")])
     done = json.loads((tmp_path / "run" / "metrics.json").read_text())["deployments"]

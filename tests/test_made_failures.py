@@ -67,7 +67,7 @@ def test_a_success_that_never_touches_or_at_once_is_refused() -> None:
 
 
 def test_a_threshold_is_tried_on_made_failures() -> None:
-    """By the gel's change at the end alone, what does not touch fails, and another object does not."""
+    """A cost that only sees the last touch rejects failures without touch, and accepts another object."""
 
     def last_cost(failure: Episode) -> float:
         side = failure.frames[TACTILE[0]].astype(float)

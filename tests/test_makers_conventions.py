@@ -104,7 +104,7 @@ def test_near_a_singularity_the_estimate_is_zero_on_the_wire_and_unknown_here() 
 
 
 def reads_ur(address: str) -> dict:
-    """What RTDE says."""
+    """Return the state as RTDE gives it."""
     from rtde_receive import RTDEReceiveInterface
 
     receive = RTDEReceiveInterface(address)

@@ -31,7 +31,7 @@ UNIT = sample_instance(GELSIGHT_MINI, RNG)
 
 
 def centres(unit: SensorInstance) -> list[tuple[float, float]]:
-    """Where balls are pressed, px from the middle: once in each part of the picture."""
+    """Return one ball centre for each part of the picture, px from the middle."""
     return [(x, y) for y in (-75, 0, 75) for x in (-110, -40, 40, 110)]
 
 
@@ -88,7 +88,7 @@ def test_a_press_that_never_stands_still_is_not_kept(session: list[np.ndarray]) 
 def test_record_presses_writes_what_calibrate_reads(
     session: list[np.ndarray], tmp_path: Path
 ) -> None:
-    """From a folder of pictures; then another ball is added to it."""
+    """A folder of pictures; then a second ball is added."""
     pictures, out = tmp_path / "pictures", tmp_path / "out"
     pictures.mkdir()
     for i, frame in enumerate(session):
@@ -192,7 +192,7 @@ def test_a_sensor_check_counts_markers() -> None:
 
 
 def test_a_darker_picture_has_a_depth(balls: list[np.ndarray]) -> None:
-    """It once had none: a surface that lies below rest all over threw shadows of negative length."""
+    """A surface below rest everywhere used to cast shadows of negative length."""
     estimator = DepthEstimator(load(GELSIGHT_MINI.sensor_file), 8)
     depth = estimator.estimate(np.rint(0.75 * balls[0]).astype(np.uint8), balls[0].astype("f4"))
     assert np.isfinite(depth).all()

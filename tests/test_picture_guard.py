@@ -35,7 +35,7 @@ MINI = load(GELSIGHT_MINI.sensor_file)
 
 
 def stretched(picture: np.ndarray) -> np.ndarray:
-    """By 8 % along the rows, the sides cut off."""
+    """Stretch by 8 % along the rows and cut off the sides."""
     height, width, _ = picture.shape
     wide = cv2.resize(np.ascontiguousarray(picture), (round(1.08 * width), height))
     left = (wide.shape[1] - width) // 2

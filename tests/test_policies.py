@@ -54,7 +54,6 @@ def test_trials_depend_on_their_seed_alone() -> None:
 
 
 def test_what_ships_picks_and_places() -> None:
-    """By name, and in an environment that shows it what it looks at."""
     policy = load_policy("pick-place")
     config = policy.env_config(PickPlaceConfig(objects=("glass_ball",)))
     assert config.cameras == ("front",) and config.tactile and config.camera_size == (256, 256)
@@ -289,7 +288,6 @@ def test_shipped_records_name_no_folder_of_a_machine() -> None:
 
 
 def test_the_films_show_the_trials(tmp_path: Path) -> None:
-    """The same images are rendered, so the same random numbers are drawn."""
     config, specs = BLIND_ENV, trial_specs(BLIND_ENV, 2, 5)
     trials = list(run_trials(config, PickPlaceExpert, specs, workers=1))
     film_trials(tmp_path, config, specs, trials, PickPlaceExpert, workers=1)

@@ -110,7 +110,7 @@ def test_windows_stay_inside_their_episode() -> None:
 
 @pytest.mark.parametrize("head", [DIFFUSION, FLOW, RegressionConfig(64, 2)])
 def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
-    """Neither in the loss nor in the normalizer, whatever the padding holds."""
+    """Padding reaches neither the loss nor the normalizer."""
     config = replace(TOY, head=head)
     dataset = toy_dataset(config, (3, 20))
     assert dataset.action_is_pad[0].tolist() == [False] * 2 + [True] * 6

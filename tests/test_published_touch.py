@@ -64,7 +64,7 @@ def test_a_lying_digit_is_turned_upright(tmp_path: Path) -> None:
 
 
 def test_touch_and_go_has_red_and_blue_put_back(tmp_path: Path) -> None:
-    """Its converter gave RGB to OpenCV's writer, which takes BGR."""
+    """The set's converter gave RGB to OpenCV's writer, which takes BGR."""
     clips = {f"2022041{i}_031604.pkl": 3 + i for i in range(4)}
     for name, count in clips.items():
         pictures = [gel(t, (480, 640)) for t in range(count)]
@@ -145,7 +145,7 @@ def test_what_is_no_such_folder_is_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
 def test_whatever_byte_is_wrong_frames_are_the_same_or_refused(tmp_path: Path, kind: str) -> None:
-    """A PNG's checksums tell every wrong byte; a JPEG that still decodes is whole but for that one."""
+    """A PNG's checksums catch every wrong byte; in a JPEG that still decodes, only that frame differs."""
     true = [gel(i, (32, 24)) for i in range(4)]
     write(tmp_path / "true.pkl", [encoded(picture, kind) for picture in true])
     whole = TouchClip("true", "digit", read_pictures(tmp_path / "true.pkl"))

@@ -36,7 +36,7 @@ Y, X = np.mgrid[:60, :80].astype(np.float32)
 
 
 def press(obj: int, frames: int = 9) -> np.ndarray:
-    """Stripes whose width and colour tell the object, after three untouched frames."""
+    """Three untouched frames, then stripes whose width and colour depend on the object."""
     rng = np.random.default_rng(obj)
     stripes = 60 * np.sin(X / (4 + 2 * obj))[..., None] * [1, 0.5 * obj, -1]
     gel = 100 + rng.normal(0, 1, (frames, 60, 80, 3))
@@ -73,7 +73,7 @@ def test_the_benchmark_judges_encoders(clips: Path) -> None:
 
 
 def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
-    """What differs between videos of one object counts less then; other objects stay apart."""
+    """Adapting shrinks distances between videos of one object relative to other objects."""
     main(["train-encoder", "adapt", "--data", str(clips), "--share", "0.9", "--out", str(tmp_path)])
     adapted = load_encoder(tmp_path / "encoder")
     goals = adapted.embed_text_goal(["a soft object", "a slightly hard object"], OfflineTowers())
@@ -93,7 +93,7 @@ def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
 
 
 def test_sentences_are_judged_on_objects_never_seen() -> None:
-    """Where touch says the ranks, sentences find them; where it does not, they do no better than guesses."""
+    """Embeddings that encode the ranks score above 0.9, noise scores at chance."""
     rng = np.random.default_rng(0)
     ranks = rng.integers(0, 3, (120, 3))
     objects = np.array([f"object{i // 2}" for i in range(120)])
@@ -117,7 +117,7 @@ def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
 
 
 def test_sentences_lie_where_what_they_tell_of_is_felt() -> None:
-    """Six kinds of touch about orthogonal directions; a triple of ranks that was never felt is named."""
+    """Touches along orthogonal directions; a combination of ranks held out of the fit is named."""
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(3, 3, 40))
     ranks = np.array([[i, j, k] for i in range(3) for j in range(3) for k in range(3)])
@@ -236,7 +236,7 @@ def test_force_is_read_of_another_object() -> None:
 
 
 def test_the_cost_falls_with_the_touch_and_tells_the_wrong_object() -> None:
-    """Two objects, felt along two directions; 0.5 N from the sixth frame on."""
+    """Two objects with orthogonal embeddings; 0.5 N from the sixth frame on."""
     strength = np.array([0, 0, 0, 0, 0, 0.4, 0.7, 1, 1, 1])
 
     def grasp(trial: int) -> EmbeddedGrasp:

@@ -50,7 +50,7 @@ def ramp() -> np.ndarray:
 
 
 class Screen(io.StringIO):
-    """What the person reads."""
+    """The terminal that the person reads."""
 
     lines: list[str]
 

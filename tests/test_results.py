@@ -47,7 +47,7 @@ def test_a_measured_record_has_the_schema_of_all(tmp_path, monkeypatch) -> None:
 
 @pytest.mark.parametrize("task", ["pick-place", "bead-maze"])
 def test_no_two_recordings_share_a_seed(task: str) -> None:
-    """However many demonstrations and corrections are asked for: a shared seed would be skipped."""
+    """A shared seed would be skipped without a word."""
     steps_of = make_policy._pick_place if task == "pick-place" else make_policy._bead_maze
     steps = steps_of(Config(task=task, demonstrations=20_000, corrections=3000), Path())  # pyright: ignore[reportArgumentType]
     recorded, asked = set(), 0

@@ -124,7 +124,7 @@ def test_before_contact_the_fingertips_cost_the_same_whatever_they_read(
 def test_pieces_of_a_trajectory_cost_the_same_as_the_whole(
     successes: list[EmbeddedEpisode], normalizer: DistanceNormalizer, value: Value
 ) -> None:
-    """What is streamed never saw what comes later, so the costs are causal, too."""
+    """So costs are causal: a streamed frame knows no later one."""
     goal = goal_at_every_frame(successes[0].take(slice(-1, None)))
     whole = compute_curves(embedded(9), goal, normalizer, value).parts
     before: dict[str, float] = {}

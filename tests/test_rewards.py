@@ -229,7 +229,7 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
 
 
 def test_an_episode_that_never_touches_stays_away_from_the_goal() -> None:
-    """Its picture ends at the goal, its touch does not; its own last frame would hide that."""
+    """The picture ends at the goal, the touch does not; its own last frame as goal would hide that."""
     training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
     normalizer = replace_text(fit_scene(training, ["image", "tactile"]))
     miss = embedded("never touches", touches=False, jitter=1.0)
@@ -314,7 +314,7 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
 
 
 def test_the_table_of_many_episodes_is_at_most_100_characters_wide() -> None:
-    """With every cell at its longest: counts of three digits behind each value."""
+    """Longest cells: counts of three digits behind each value."""
     rng = np.random.default_rng(0)
     curves = []
     for k in range(300):

@@ -37,7 +37,7 @@ def reading(q: np.ndarray, **changes: object) -> Measurements:
 
 
 def check(layer: ActionFilter, path: list[SafetyState]) -> None:
-    """Nothing that comes out after the first is beyond any limit, the maker's taper included."""
+    """Assert that no state after the first exceeds any limit, the maker's taper included."""
     j, dt = layer.joints, layer.dt
     q, velocity = np.stack([s.q for s in path]), np.stack([s.velocity for s in path])
     assert np.isfinite(q).all()

@@ -42,7 +42,7 @@ def test_short_convolution_is_a_convolution(ticks: int) -> None:
 
 
 def exact(config: SamplerConfig):
-    """What a perfect network answers for samples of one Gaussian."""
+    """Return the exact denoiser for samples of one Gaussian."""
 
     def network(x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         if config.kind == "flow":

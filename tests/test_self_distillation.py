@@ -50,7 +50,7 @@ def toy_dino(config: DinoConfig = TOY) -> Dino:
 
 
 def test_the_loss_of_views_is_that_of_the_paper() -> None:
-    """By equation 3: of every other pair of views, with a teacher centred and sharpened."""
+    """Equation 3: cross-entropy of every pair of different views, with a centred, sharpened teacher."""
     model = toy_dino(replace(TOY, batch_norm=False)).train()
     touch, drawn = moving_blobs(4).touch, model.draw(4, rng())
     model.center.normal_(generator=rng(1))
@@ -75,7 +75,7 @@ def test_the_loss_of_views_is_that_of_the_paper() -> None:
 
 @pytest.mark.parametrize("reads", ["mean", "register"])
 def test_the_teacher_learns_by_averaging_alone(reads: str) -> None:
-    """As torch's own AveragedModel with a decay, momentum rising linearly."""
+    """Equals torch's AveragedModel with linearly rising momentum."""
     model = toy_dino(replace(TOY, reads=reads, momentum=0.9, final_momentum=1.0))
     oracle = AveragedModel(model.backbone, multi_avg_fn=get_ema_multi_avg_fn(0.9))
     oracle.update_parameters(model.backbone)  # the first is a copy

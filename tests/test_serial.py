@@ -28,7 +28,7 @@ from touchgoal.runtime.errors import UserError
 
 @pytest.fixture
 def line() -> Iterator[tuple[int, str]]:
-    """The device's end of a serial line, and the path of the computer's."""
+    """Yield the device's end of a serial line and the path of the computer's end."""
     device, computer = os.openpty()
     tty.setraw(device)
     tty.setraw(computer)
@@ -73,7 +73,7 @@ def test_a_load_cell_is_read_in_newtons(line: tuple[int, str]) -> None:
 
 @pytest.mark.parametrize(("checksum", "believed"), [("none", 6436), ("xor", 145), ("crc16", 0)])
 def test_how_many_garbled_lines_are_believed(checksum: Checksum, believed: int) -> None:
-    """Of 30,000 or more; the shares stand in the driver's docstring. With crc16, none."""
+    """Counts among over 30,000 lines; the driver's docstring has the shares."""
     cell = LoadCellConfig("", 2e-4, 84_213, max_force=100.0, checksum=checksum)
     rng, lines, sent, stream = random.Random(0), set(), set(), []
     for k in range(50_000):
@@ -202,7 +202,7 @@ class Gripper2F85(threading.Thread):
 
 
 def test_the_check_is_that_of_the_grippers_manual() -> None:
-    """Its examples: clear the activation, read the status while active."""
+    """The manual's examples: clear the activation, read the status while active."""
     assert modbus_crc(bytes.fromhex("091003E8000306000000000000")) == bytes.fromhex("7330")
     assert modbus_crc(bytes.fromhex("090407D00003")) == bytes.fromhex("B1CE")
 

@@ -68,7 +68,7 @@ def test_learned_positions_start_as_the_fixed_ones_and_hold_for_one_size() -> No
 
 
 class Scheduler:
-    """What a training pickles beside its weights: an object whose class runs code when loaded."""
+    """A pickled object whose class runs code when loaded, as beside a training's weights."""
 
     def __init__(self, path: Path, function: Any) -> None:
         self.path, self.function = path, function
@@ -186,7 +186,7 @@ def video(n: int = 9, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
 
 
 def prepared(frame: np.ndarray, background: np.ndarray | None, size: tuple[int, int]) -> np.ndarray:
-    """One frame, (3, H, W): background removed, turned clockwise, resized, 0 to 1."""
+    """Prepare a frame (3, H, W): background removed, turned clockwise, resized, 0 to 1."""
     if background is not None:
         change = (frame.astype(float) - background.astype(float)) / 255 + 0.5
         frame = (255 * np.clip(change, 0, 1)).astype(np.uint8)
@@ -249,7 +249,7 @@ def test_pictures_of_any_sensor_become_upright_four_by_three(tmp_path: Path) -> 
 
 
 def test_ids_of_hugging_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its client's own cache, filled as by a download; nothing is fetched."""
+    """Uses the client's cache, filled as by a download."""
     constants = pytest.importorskip("huggingface_hub.constants")
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))

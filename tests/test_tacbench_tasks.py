@@ -52,7 +52,7 @@ def test_the_field_over_the_picture_adds_up_to_the_force() -> None:
 
 
 def held(attempt: GraspAttempt) -> bool | None:
-    """What friction alone says: grips beyond doubt hold, grips far below the weight do not."""
+    """Return whether friction alone must hold the object; None where it is close."""
     friction, weight = attempt.body.kind.material.friction, 9.81 * attempt.body.mass
     share = 2 * friction * attempt.grip / weight
     return True if share > 4 else False if share < 0.6 else None

@@ -103,7 +103,7 @@ def test_scan_lines_find_what_rays_find() -> None:
 
 
 def sense(body: Body, at: np.ndarray | list[float], force: float = 10.0) -> TactileFrame:
-    """What a nominal Mini shows of a body held at `at` (m) in its frame."""
+    """Press a body at `at` (m, sensor frame) on a nominal Mini."""
     bench = PressBench(body, MINI, INSTANCE)
     bench.place(np.asarray(at, float))
     return bench.sense(force, np.random.default_rng(1), centre=(float(at[0]), float(at[1])))
@@ -194,7 +194,7 @@ def test_turned_lights_turn_the_response() -> None:
 @pytest.mark.parametrize("sensor", [GELSIGHT, DIGIT], ids=lambda s: s.name)
 @pytest.mark.parametrize("largest_turn", [0.0, 80.0])
 def test_shadows_fall_opposite_the_bright_sides(sensor: SensorModel, largest_turn: float) -> None:
-    """Of each light alone, on a bump: the colours brighten towards it, the shadow lies behind."""
+    """Each light alone on a bump: bright towards the light, shadow behind."""
     lights = replace(NO_RANDOMIZATION, azimuth=largest_turn)
     y, x = np.mgrid[:120, :160].astype(np.float32) - np.array([60, 80], np.float32)[:, None, None]
     bump = 6e-4 * np.exp(-(x**2 + y**2) / (2 * 9**2)).astype(np.float32)

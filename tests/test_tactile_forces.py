@@ -46,7 +46,7 @@ EVERYWHERE = block(-1, 1, -1, 1)
 def wrench(
     normal: float, at: tuple = (0.0, 0.0), shear: tuple = (0.0, 0.0), torsion: float = 0.0
 ) -> PadContact:
-    """What a solver says of a force at one point of the sunk gel, and a torsion about the point."""
+    """Return the contact of a force at one point of the sunk gel, and a torsion about the point."""
     force = np.array([*shear, -normal])
     point = np.array([*at, -normal / MINI.normal_stiffness])
     torque = np.cross(point, force) + [0, 0, torsion]
@@ -56,7 +56,7 @@ def wrench(
 def feel(
     height: np.ndarray, *contacts: PadContact, friction: float = FRICTION, modulus: float = 3e8
 ) -> ForceField:
-    """The field after a history of contacts."""
+    """Return the force field after a history of contacts."""
     field = None
     for contact in contacts:
         press = press_until_balanced(height, GRID.pitch, contact, modulus, MINI)

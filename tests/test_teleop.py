@@ -36,7 +36,7 @@ def maze():
 def moved(
     maze: BeadMaze, hand: Teleoperator, wrench: tuple[float, ...] = (0.0,) * 6
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How far an action takes the hand (m), and its rotation before and after."""
+    """Return an action's displacement of the hand (m), and its rotation before and after."""
     before, R = maze.kinematics.forward(maze.command)
     action = hand.act({ft.WRENCH: np.array(wrench, np.float32)})
     assert action[-1] == 0  # the gripper stays closed
@@ -97,7 +97,7 @@ def test_the_hand_gives_way_to_the_wire(maze: BeadMaze) -> None:
 
 
 def test_a_person_leads_the_bead(tmp_path: Path) -> None:
-    """One wire led some way, one given up, Ctrl-C in the third: the first is on disk."""
+    """One run to the time limit, one given up, Ctrl-C in the third: the first is on disk."""
     end, terminal = os.openpty()
     settings = termios.tcgetattr(terminal)
     command = [sys.executable, "-m", "touchgoal.launch", "teleop", "--episodes", "3"]

@@ -128,7 +128,7 @@ def test_other_weights_in_the_wheel_are_refused(
 
 
 def test_missing_wheels_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the clone to install them from: touchgoal is on no package index."""
+    """The message names the clone, since touchgoal is on no package index."""
     monkeypatch.setattr(efficientnet, "WHEEL", "no_such_wheel")
     for load in (efficientnet.load_efficientnet_lite0, OfflineTowers):
         with pytest.raises(UserError, match=r"no_such_wheel is missing: pip install") as error:

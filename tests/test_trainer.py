@@ -110,7 +110,7 @@ test_trainer.train_everything(Path(sys.argv[1]))
 
 
 def train_everything(out: Path) -> None:
-    """By plain gradient descent: Adam would not show gradients that are twice too large."""
+    """Train by plain SGD: Adam would hide gradients that are twice too large."""
     import test_align
     import test_mae
     import test_self_distillation

@@ -1,4 +1,4 @@
-"""The twin's Franka control interface, through libfranka."""
+"""The twin's Franka control interface, through libfranka, and its limits."""
 
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from running_twin import RunningTwin, client, yaw_of
+
+from touchgoal.control.safety.limits import FR3
+from touchgoal.sim_envs.twin.franka.limits import Setpoint, joint_fault
 
 HOME = [0.0, -0.3, 0.0, -2.2, 0.0, 1.9, 0.785]
 
@@ -206,3 +209,19 @@ def test_franka_stops_for_a_fault(
     assert error in result["error"] and result["mode"] == mode
     assert "rejected" in result["rejected"] and result["recovered"] == recovers
     assert fr3.at_rest()["worst"]["excess"] <= 0
+
+
+@pytest.mark.parametrize("joint", range(7))
+@pytest.mark.parametrize("end", [0, 1])
+def test_speeds_are_refused_above_the_range_of_their_place(joint: int, end: int) -> None:
+    limits, zero = FR3.hardware, np.zeros(7)
+    for share in np.linspace(0.02, 0.98, 25):  # near the ends of the range less is allowed
+        q = FR3.arm.home.copy()
+        q[joint] = limits.lower[joint] + share * (limits.upper - limits.lower)[joint]
+        speed = limits.speed_range(q)[end][joint]
+        for factor, fault in ((1.005, None), (1.02, "velocity_limits_violation")):
+            dq = zero.copy()
+            dq[joint] = factor * speed + (2e-3 * np.sign(speed) if fault else 0.0)
+            found = joint_fault(Setpoint(q, dq, zero), Setpoint(q, dq, zero), cartesian=False)
+            if abs(speed) > 0.01:
+                assert found == (fault and f"joint_motion_generator_{fault}"), (share, factor)

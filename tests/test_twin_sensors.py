@@ -1,5 +1,6 @@
 """The twin's cell without a wire; its pictures, its serial devices, and what it says to mistakes."""
 
+import socket
 import time
 from typing import Literal
 
@@ -129,8 +130,42 @@ def test_mistakes_say_what_to_do(fr3: RunningTwin) -> None:
         twin_client.ask_twin("127.0.0.1:9", "truth")
 
 
+def test_web_pages_and_nonsense_change_nothing_at_the_control_port(fr3: RunningTwin) -> None:
+    token, _, where = fr3.cell.task.twin.rpartition("@")
+    host, _, number = where.rpartition(":")
+    for stranger in ("kill", "x kill", f"{token[:-1]} kill"):
+        with socket.create_connection((host, int(number)), timeout=5) as other:
+            other.sendall(f"{stranger}\n".encode())
+            assert b"token" in other.recv(100) and other.recv(100) == b""
+    with socket.create_connection((host, int(number)), timeout=5) as page:
+        body = f"stop-button on\n{token} nudge 0 400 0 5\n{token} kill\n"
+        page.sendall(
+            f"POST / HTTP/1.1\r\nHost: {where}\r\nOrigin: http://a.example\r\n"
+            f"Content-Type: text/plain\r\nContent-Length: {len(body)}\r\n\r\n{body}".encode()
+        )
+        assert page.recv(100) == b""
+    rng = np.random.default_rng(1)
+    for line in (
+        "nudge nan 0 0 1",
+        "nudge 1e308 0 0 1",
+        "freeze nan",
+        "freeze inf",
+        "reset -1",
+        "reset 1 " + "[" * 100_000,
+        "reset 99999999999999999999999",
+        "stall front",
+        "error " + "x" * 1000,
+        "truth\x00",
+        *(rng.bytes(40).decode("latin-1").replace("\n", "") for _ in range(50)),
+    ):
+        with pytest.raises(UserError):
+            fr3.ask(line)
+    truth = fr3.ask("truth")
+    assert np.isfinite(truth["q"]).all() and truth["rest"] > 0
+
+
 def test_streams_that_have_sent_as_many_pictures_are_told_apart() -> None:
-    """As when the clients of two cameras come at once: the process that takes pictures ended by it."""
+    """Comparing streams by value ended the rendering process."""
     streams = [Stream(clients=1) for _ in range(2)]
     for stream in streams:
         stream.publish(np.zeros((4, 4, 3), np.uint8))

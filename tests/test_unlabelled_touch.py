@@ -41,7 +41,7 @@ def press(brightness: int) -> np.ndarray:
 
 
 def write_videos(folder: Path, splits: tuple[str, ...] = SPLITS, brightness: int = 180) -> Path:
-    """One video of each split: the held-out ones are darker than untouched, the others brighter."""
+    """Write one video per split: held-out ones darken when touched, the others brighten."""
     (folder / "videos").mkdir(parents=True)
     with (folder / "labels.csv").open("w", newline="") as file:
         rows = csv.writer(file)
@@ -180,7 +180,7 @@ def pictures(n: int) -> np.ndarray:
 
 @torch.no_grad()
 def by_hand(encoder: TouchBackbone, frames: np.ndarray, i: int) -> np.ndarray:
-    """What is felt at frame i, the newest frame first; the first frame stands for those before it."""
+    """Embed frame i with its past, newest first; the first frame stands for those before it."""
     preprocess, clip = preprocessor_for("gelsight_mini"), encoder.config.vit.tubelet > 1
     seen = [preprocess(frames[max(i - STRIDE * k, 0)][None], frames[0])[0] for k in range(4)]
     touch = np.stack(seen, 1) if clip else np.concatenate(seen[:2])
@@ -202,7 +202,7 @@ def test_recorded_frames_are_embedded_with_their_past(vit: ViTConfig, tmp_path: 
 @pytest.mark.parametrize("vit", [PRESETS["tiny"], PAIR, CLIP], ids=["one", "two", "clip"])
 @pytest.mark.parametrize("real_time", [False, True])
 def test_a_policy_feels_what_its_training_did(vit: ViTConfig, real_time: bool) -> None:
-    """Also between plans, when nobody asks: the past is what was observed, not what was embedded."""
+    """Also between plans: the past holds observed frames, not embedded ones."""
     touch, ticks = TouchEmbedder(backbone(vit), "toy"), toy_observations(14)
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=4)
     planner, embedded = LearnedPolicy(PolicyNetwork(config).eval(), touch), {}

@@ -59,7 +59,7 @@ def test_a_fingertips_view_is_chosen_by_its_model_for_a_device_too() -> None:
 
 
 class PluggedCamera:
-    """What OpenCV says of a camera that gives one picture and is then pulled out."""
+    """OpenCV's capture of a camera that gives one picture and is then unplugged."""
 
     def __init__(self, keeps: float = 0.0) -> None:
         self.set_to: dict[int, float] = {}

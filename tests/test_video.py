@@ -125,7 +125,7 @@ def test_a_frozen_picture_and_a_stalled_stream_grow_old_and_are_said(streamer: S
 
 
 def test_pictures_cut_in_half_are_refused_and_said(streamer: Streamer) -> None:
-    """FFmpeg would fill the rest with the picture before, silently."""
+    """FFmpeg would silently fill the rest from the picture before."""
     camera = VideoCamera(VideoConfig(streamer.url, rate=50.0))
     until(lambda: camera.problem == "")
     streamer.damage = lambda jpeg: jpeg[: len(jpeg) // 2]

@@ -153,7 +153,7 @@ def test_opening_the_hand_loses_nothing_and_lifting_is_carrying() -> None:
 def hand_fault(
     readings: list[tuple[float, bool]], commanded: float, indentation: float | None = 0.5e-3
 ) -> str:
-    """The first fault that these readings (width, grasped), one a tick of 50 ms, lead to."""
+    """Return the first fault for these readings (width, grasped), one a tick of 50 ms."""
     monitor = HandMonitor(FR3.tool)
     touched = None if indentation is None else np.full(2, indentation)
     faults = (

@@ -9,7 +9,7 @@ SENSOR = "gelsight_mini_markers"
 
 
 def moving_blobs(count: int, seed: int = 0, frames: int = 2) -> TouchFrames:
-    """Contacts somewhere on the gel, at several moments, newest first; the "force" says where and how strong."""
+    """Return moving contacts, newest frame first; the "force" holds place and strength."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:120, :160]
     place = rng.uniform((30, 30), (90, 130), (count, 2))

@@ -20,7 +20,7 @@ PLACES = ((70.0, 95.0), (165.0, 45.0), (160.0, 118.0))  # centres of the objects
 
 @dataclass
 class Scene:
-    """One recording and what is right about it.
+    """One recording with its ground truth.
 
     Attributes:
         name: Name of its folder.

@@ -27,7 +27,7 @@ _MOST = 8  # queued targets; more mean a clock faster than the policy's: the que
 
 @dataclass(frozen=True)
 class TrackerState:
-    """One millisecond of the tracker."""
+    """State of the tracker at one millisecond."""
 
     q: Joints  # commanded joint positions, rad
     # targets: the reference's next ones, rad; step: its motion in a millisecond at their pace, rad

@@ -61,7 +61,7 @@ class Timing:
 
     @property
     def duration(self) -> float:
-        """From rest to rest, s."""
+        """Duration from rest to rest, s."""
         return float(self.starts[-1])
 
     def derivatives(self, t: Times) -> tuple[Times, Times, Times, Times]:
@@ -92,7 +92,7 @@ class Trajectory:
 
     @property
     def duration(self) -> float:
-        """From rest to rest, s."""
+        """Duration from rest to rest, s."""
         return self.timing.duration
 
     def at(self, t: Float[np.ndarray, "*k"] | float) -> Float[np.ndarray, "*k n"]:

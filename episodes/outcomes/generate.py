@@ -60,7 +60,7 @@ def _freeze(frames: Frames, contact: int, other: Frames) -> Frames:
 
 
 def _drop(frames: Frames, contact: int, other: Frames) -> Frames:
-    """From half-way between contact and the end on, touch is as without contact and the cameras show one frame."""
+    """Lose the object half-way from contact to the end: no touch from then on, the cameras stand still."""
     lost = (contact + _length(frames)) // 2
     held = _played(frames, np.minimum(np.arange(_length(frames)), lost))
     return _touch(
@@ -69,13 +69,13 @@ def _drop(frames: Frames, contact: int, other: Frames) -> Frames:
 
 
 def _rewind(frames: Frames, contact: int, other: Frames) -> Frames:
-    """Half-way from contact to the end everything is played backwards."""
+    """Play everything backwards from half-way between contact and the end."""
     turn = (contact + _length(frames)) // 2
     return _played(frames, np.concatenate([np.arange(turn), np.arange(turn)[::-1]]))
 
 
 def _over_press(frames: Frames, contact: int, other: Frames) -> Frames:
-    """The change of the gel's picture is doubled: roughly a deeper press, not its wider contact."""
+    """Double the gel picture's change: roughly a deeper press, without its wider contact."""
 
     def pressed(side: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, "n h w 3"]:
         background = touch_background(side).astype(np.float32)

@@ -118,7 +118,7 @@ class DeployedHand:
 
 
 class DeployedArm:
-    """One episode, from where the arm rests."""
+    """The environment's arm as deployed, for one episode that begins at rest."""
 
     def __init__(self, env: Any, between: DeploymentConfig, rng: np.random.Generator) -> None:
         """Draw delays of an environment's episode from a resolved config."""

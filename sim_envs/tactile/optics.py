@@ -29,7 +29,7 @@ def _response(x, y, depth, k):
 @njit(inline="always")
 @no_type_check
 def _along(k, slope, v):
-    """One channel's coefficients at height v, in a tuple: an array might alias the output."""
+    """Return a channel's coefficients at height v, as a tuple: an array might alias the output."""
     return (
         k[0] + v * slope[0],
         k[1] + v * slope[1],

@@ -45,7 +45,7 @@ class TactileFrame:
 
     @property
     def mask(self) -> Bool[np.ndarray, "h w"]:
-        """Where an object touches the gel, at the image's resolution."""
+        """Pixels at which an object touches the gel."""
         h, w, _ = self.image.shape
         return cv2.resize(self.overlap, (w, h), interpolation=cv2.INTER_LINEAR) > 0
 

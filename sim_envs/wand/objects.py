@@ -67,7 +67,7 @@ class WandObject:
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
-        """Its pieces."""
+        """The rigid pieces that it is made of."""
         common = {k: v for k, v in self._entry.items() if k != "parts"}
         rng = np.random.default_rng(self.number)
         return tuple(p for one in self._entry["parts"] for p in _parts(common | one, rng))

@@ -32,7 +32,7 @@ COMMANDS = {
 
 
 def drive(name: str, python: str, folder: str, number: int) -> tuple[dict[str, bool], str]:
-    """What is as it should be, and figures; `python` is the environment's, `folder` holds the server."""
+    """Drive a controller; return the checks and figures. `python`: of the environment; `folder`: the server's."""
     address = f"127.{60 + number}.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
     command = [part.format(address=address) for part in COMMANDS[name]]
     server = subprocess.Popen(

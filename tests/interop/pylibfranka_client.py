@@ -17,7 +17,7 @@ _THRESHOLDS = [20.0] * 7, [20.0] * 7, [30.0] * 6, [30.0] * 6
 
 
 def run(control: lib.ActiveControlBase, seconds: float, command: Callable) -> np.ndarray:
-    """Commands for so long; the last joint positions."""
+    """Send commands for some seconds; return the last joint positions."""
     time = 0.0
     while True:
         state, duration = control.readOnce()
@@ -30,13 +30,13 @@ def run(control: lib.ActiveControlBase, seconds: float, command: Callable) -> np
 
 
 def smooth(time: float, seconds: float) -> float:
-    """From 0 to 1, at rest at both ends."""
+    """Return a smooth step from 0 to 1, at rest at both ends."""
     share = min(time / seconds, 1.0)
     return share**3 * (10 - 15 * share + 6 * share**2)
 
 
 def main(address: str) -> None:
-    """All of it on one arm."""
+    """Run every mode on one arm."""
     result: dict[str, object] = {}
     robot = lib.Robot(address, lib.RealtimeConfig.kIgnore)
     robot.automatic_error_recovery()

@@ -24,7 +24,7 @@ BODIES: tuple[Body, ...] = ("flat", "ball", "cylinder", "edge", "bar", "corner")
 
 @dataclass(frozen=True)
 class Surface:
-    """One surface."""
+    """One body with a texture."""
 
     body: Body  # its coarse shape where it meets the gel
     size: float  # radius of a ball or cylinder, half a bar's width, m; else unused
