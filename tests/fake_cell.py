@@ -1,7 +1,8 @@
-"""A cell of fake devices that do as they are commanded, to test the control loop."""
+"""A cell of fake devices that do as they are commanded, to test the control loop; a cell file."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -11,6 +12,19 @@ from touchgoal.control.deployment.control_loop import ControlLoop, Ending, RunLo
 from touchgoal.control.interfaces import Actor, ArmReading, Frame, GripperReading, LoadReading
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
+
+SIM = """
+arm = "sim"
+gripper = { kind = "franka_hand" }
+cameras.front = { source = "simulated" }
+task = { name = "pick-place", policy = "expert", objects = ["wooden_block"], seed = 3 }
+"""
+
+
+def write_cell_file(folder: Path, text: str) -> Path:
+    path = folder / "cell.toml"
+    path.write_text(text)
+    return path
 
 
 @dataclass

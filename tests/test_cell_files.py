@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from fake_cell import SIM, write_cell_file
 
 from touchgoal.control.cell.cell_file import (
     CELLS,
@@ -23,19 +24,7 @@ from touchgoal.launch.deploy import load_policy
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig
 
-SIM = """
-arm = "sim"
-gripper = { kind = "franka_hand" }
-cameras.front = { source = "simulated" }
-task = { name = "pick-place", policy = "expert", objects = ["wooden_block"], seed = 3 }
-"""
 REAL = (EXAMPLES / "fr3_two_minis.toml").read_text()
-
-
-def write_cell_file(folder: Path, text: str) -> Path:
-    path = folder / "cell.toml"
-    path.write_text(text)
-    return path
 
 
 @pytest.mark.parametrize("path", CELLS.values(), ids=lambda p: p.stem)

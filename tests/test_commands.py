@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,8 @@ from safetensors.torch import load_file
 from touchgoal.benchmarks.papers.reward_quality import benchmark, recording
 from touchgoal.control.features import STATE
 from touchgoal.encoders import pretrained
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
+from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import COMMANDS, main, usage
@@ -349,3 +352,18 @@ def test_corrupt_episode_is_skipped_and_named(
     next(broken.rglob("observation.images.front/**/*001.mp4")).unlink()
     message = refused(capsys, "reward-curves", broken, "--out", tmp_path / "none")
     assert "nothing could be measured" in message and data[0].name in message
+
+
+def test_encoder_speed_prints_every_encoder_beside_its_peer(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    pair = replace(PRESETS["tiny"], channels=6)
+    backbone = TouchBackbone(TouchBackboneConfig.for_sensor(pair, "gelsight_mini", 2))
+    pretrained.save(backbone, tmp_path / "pair", {})
+    run("benchmark", "encoder-speed", "--encoders", tmp_path / "pair", "gelsight_mini_surfaces", "--shapes",
+        "mae-tiny", "--batch-size", 2, "--repeats", 1, "--ticks", 1, "--out", tmp_path / "run")  # fmt: skip
+    printed = capsys.readouterr().out
+    assert "Sparsh mae-tiny, random" in printed
+    rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
+    assert [row["precision"] for row in rows] == ["fp32", "bf16", "fp32", "fp32", "bf16"]
+    assert all((row["batched_ratio"] is None) == ("surfaces" in row["encoder"]) for row in rows)

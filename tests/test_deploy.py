@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_cell import SIM, write_cell_file
 from running_twin import RunningTwin
 
 from touchgoal.control import features as ft
@@ -37,12 +38,6 @@ from touchgoal.policies import checkpoint
 from touchgoal.sim_envs.cell.in_process import simulate_cell
 
 _PATIENCE = 600  # s for a loop, on a machine however loaded
-SIM = """
-arm = "sim"
-gripper = { kind = "franka_hand" }
-cameras.front = { source = "simulated" }
-task = { name = "pick-place", policy = "expert", objects = ["wooden_block"], seed = 3 }
-"""
 
 
 def run(*arguments: object) -> None:
@@ -63,12 +58,6 @@ def deploying(twin: RunningTwin, out: Path) -> "subprocess.Popen[str]":
     command = [sys.executable, "-m", "touchgoal.launch", "deploy", str(twin.cell_file)]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([*command, "--execute", "--yes", "--out", str(out / "run")], **pipes)
-
-
-def write_cell_file(folder: Path, text: str) -> Path:
-    path = folder / "cell.toml"
-    path.write_text(text)
-    return path
 
 
 @pytest.mark.slow
