@@ -23,7 +23,7 @@ COMMANDS = {
     "list": "objects, sensors, tasks, policies, encoders and benchmarks by name",
     "collect-demos": "record an expert's episodes of a task, or failures on purpose",
     "collect-touches": "record touches of objects: the MMWand data set, or slides to learn from without labels",
-    "teleop": "lead the bead along a wire with keys, and record it",
+    "record-demos": "lead an arm or the twin by SpaceMouse or keys, and record demonstrations",
     "annotate": "find and caption the objects that VisGel's recordings touch",
     "train-encoder": "train a touch encoder",
     "train-estimators": "train networks that estimate contact from touch and poses from camera pictures",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from touchgoal.runtime.errors import UserError, require_all_ok
+from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
 
 if TYPE_CHECKING:
@@ -42,6 +42,8 @@ class Config:
     """Use a simulated arm in place of the cell file's."""
     seed: Seed | None = None
     """Random seed of the scene, in place of the cell file's (simulated arm or twin only)."""
+    task: str = ""
+    """Name of a task of your own, in place of the cell file's."""
     out: Path | None = None
     """Folder of the run; the episode goes to its `episodes/`, after those already there."""
 
@@ -50,9 +52,11 @@ def main(config: Config) -> None:
     """Check, connect, ask, run, record, report; the exit status says how it ended."""
     from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
     from touchgoal.control.deployment.preflight import check_client
+    from touchgoal.launch.support.cell_run import connect
     from touchgoal.runtime.run_folder import open_run
 
-    cell = read_cell_file(find_cell_file(config.cell), config.policy, config.sim, config.seed)
+    file = find_cell_file(config.cell)
+    cell = read_cell_file(file, config.policy, config.sim, config.seed, config.task)
     policy = load_policy(cell)
     cost = None
     if cell.task.rewards:
@@ -62,7 +66,7 @@ def main(config: Config) -> None:
     check_client(cell)
     out = open_run(config.out, "deploy", config, adds=True)
     print(_summary(cell, config), flush=True)
-    connection = _connect(cell)
+    connection = connect(cell)
     try:
         result = _deploy(config, cell, policy, cost, connection, out / "episodes")
     finally:
@@ -77,6 +81,8 @@ def load_policy(cell: "CellConfig") -> "DeployedPolicy | None":
     from touchgoal.control.deployment.actors import SCRIPTED, load_user_policy
     from touchgoal.sim_envs.twin.cell_task import env_config_of
 
+    if not cell.task.policy:
+        raise UserError("task.policy is missing: name one in the cell file, or by --policy")
     if cell.task.policy in SCRIPTED:
         return None
     options = env_config_of(cell)
@@ -85,26 +91,6 @@ def load_policy(cell: "CellConfig") -> "DeployedPolicy | None":
     from touchgoal.policies.by_name import load_saved_policy
 
     return load_saved_policy(cell, options)
-
-
-def _connect(cell: "CellConfig") -> "CellConnection":
-    """Connect to the cell, once a twin has put its scene back."""
-    from touchgoal.control import features as ft
-    from touchgoal.control.cell.connection import connect_cell
-    from touchgoal.control.cell.twin_client import put_scene_back
-    from touchgoal.control.interfaces import DriverError
-
-    if cell.arm == "sim":
-        from touchgoal.sim_envs.cell.in_process import simulate_cell
-
-        return simulate_cell(cell, ft.CONTROL_HZ)
-    if cell.task.twin:
-        put_scene_back(cell.task.twin, cell.task.seed)
-        print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
-    try:
-        return connect_cell(cell, ft.CONTROL_HZ)
-    except DriverError as error:
-        raise UserError(str(error)) from error
 
 
 def _summary(cell: "CellConfig", config: Config) -> str:
@@ -121,34 +107,20 @@ def _deploy(
     connection: "CellConnection",
     episodes: Path,
 ) -> "Result":
-    import numpy as np
+    from functools import partial
 
     from touchgoal.control import features as ft
-    from touchgoal.control.cell.limits import cell_watchdogs
     from touchgoal.control.deployment.actors import make_actor
     from touchgoal.control.deployment.control_loop import Request
-    from touchgoal.control.deployment.preflight import preflight
     from touchgoal.control.deployment.session import Session
     from touchgoal.control.deployment.terminal import HELP, Terminal
-    from touchgoal.control.safety.action_filter import ActionFilter
-    from touchgoal.episodes.schema import Episode
-    from touchgoal.episodes.store import EpisodeWriter
+    from touchgoal.launch.support.cell_run import check_cell, record_episode
     from touchgoal.launch.support.confirm import confirm
-
-    def writer() -> EpisodeWriter:
-        return EpisodeWriter(episodes, ft.CONTROL_HZ)
-
-    def record(frames: dict[str, np.ndarray], task: str, meta: dict[str, Any]) -> int:
-        return writer().append(Episode(frames, task, meta))
 
     def request() -> Request:
         return terminal.operator_request() or ("failed" if cost and cost.failed else "")
 
-    safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
-    print("checks before anything moves:", flush=True)
-    results = preflight(cell, connection, safety, episodes, lambda: len(writer()))
-    print("\n".join(map(str, results)), flush=True)
-    require_all_ok(results)
+    safety = check_cell(cell, connection, episodes)
     if config.execute and not config.yes:
         confirm(cell)
     terminal = Terminal()
@@ -156,7 +128,7 @@ def _deploy(
         cell=cell,
         connection=connection,
         safety=safety,
-        record=record,
+        record=partial(record_episode, episodes),
         execute=config.execute,
         make_actor=lambda loop: make_actor(cell, policy, safety, connection.truth, loop.commanded),
         operator_request=request,

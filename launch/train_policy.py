@@ -3,7 +3,7 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, cast
 
 from touchgoal.encoders.training.options import TrainingOptions
 from touchgoal.policies.config import (
@@ -64,8 +64,9 @@ class Config(TrainingOptions):
     """Also train on episodes that do not say whether they succeeded."""
     trim_pauses: bool = False
     """Leave out the frames of each episode before arm or gripper first move."""
-    task: TaskName | None = None
-    """Task of the episodes, in which snapshots are tried; default: the one they name."""
+    task: str | None = None
+    """Task of the episodes; default: the one they name. Snapshots are tried in pick-place or bead-maze; of
+    any other task, which is known by its recordings alone, the last one is taken."""
     encoder: Path | None = None
     """Frozen touch encoder: a folder (train-encoder), or the name of a shipped one; default: none."""
     end_to_end: bool = False
@@ -142,15 +143,19 @@ def main(config: Config) -> None:
     rows[0] = rows[0][: max(1, round(config.share * len(rows[0])))]
     chosen = list(zip(sets, rows, strict=True))
     task = training_data.find_task(chosen, config.task)
-    env = _env(config, task)
+    simulated = cast(TaskName, task) if task in ENVS else None
+    trials = config.trials if simulated else 0
+    env = _env(config, simulated) if simulated else None
     reads_touch = config.encoder or config.end_to_end or config.estimator
     sensor = training_data.common_sensor(chosen) if reads_touch else ""
-    if config.trials:
+    if env is not None and trials:
         training_data.check_sensor(sensor, env.sensor)
     pauses = [training_data.find_pauses(*one) for one in chosen]
     policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
     out = open_training(config, "train-policy")
     print(f"{task}: {found[0]} for training, {found[1]} for validation")
+    if not simulated:
+        print(f"no simulator knows {task!r}: snapshots are not tried, the last one is taken")
     training_data.report_pauses(pauses[0], sets[0].fps, config.trim_pauses)
     skipped = pauses if config.trim_pauses else [None, None]
     recordings = (
@@ -164,11 +169,14 @@ def main(config: Config) -> None:
     if not is_first_process():
         return
     add_parts(out / POLICY, parts)
-    if config.trials:
-        scores = select(out, parts, lambda d: score(d, env, config.trials, config.workers))
+    if env is not None and trials:
+        scores = select(out, parts, lambda d: score(d, env, trials, config.workers))
         write_json(out / "metrics.json", {"snapshots": scores})
     print(f"policy: {out / POLICY}")
-    print(f"next: touchgoal run-policy --task {task} --policy {out / POLICY}")
+    if simulated:
+        print(f"next: touchgoal run-policy --task {task} --policy {out / POLICY}")
+    else:
+        print(f"next: touchgoal deploy CELL --policy {out / POLICY}")
 
 
 def _policy_config(

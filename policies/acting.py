@@ -167,19 +167,20 @@ class LearnedPolicy:
         ]
         return torch.from_numpy(np.stack(images, 1))
 
-    def env_config(self, task: Task | None = None) -> Task:
+    def env_config(self, task: Task | None = None, name: str = "") -> Task:
         """Return a task's options with the images that the policy reads, and no others.
 
-        Default: the options of the policy's task, with its sensor. UserError: it cannot act in the
-        task.
+        Default: the options of the policy's task, with its sensor. `name` is the task's, where it
+        is not the simulated one's. UserError: the policy cannot act in the task.
         """
         config = self.config
         if task is None:
-            if not config.task:
-                raise UserError(f"{self._name} does not name its task: give a config")
+            if config.task not in TASKS:
+                known = f"is for {config.task!r}" if config.task else "does not name its task"
+                raise UserError(f"{self._name} {known}, which no simulator knows: give a config")
             task = cast(Task, TASKS[cast(TaskName, config.task)](control_hz=config.control_hz))
             task = replace(task, sensor=config.sensor or task.sensor)
-        self._check_task(task)
+        self._check_task(task, name or task_name(task))
         estimator = self._learned_estimator
         reads_touch = config.touch_dim > 0 or config.end_to_end is not None or estimator is not None
         if estimator is None:
@@ -197,14 +198,14 @@ class LearnedPolicy:
     def _name(self) -> str:
         return f"the policy in {self.directory}" if self.directory else "the policy"
 
-    def _check_task(self, task: EnvConfig) -> None:
-        """Raise UserError if the policy cannot act in the task."""
-        config, name = self.config, task_name(task)
+    def _check_task(self, task: EnvConfig, name: str) -> None:
+        """Raise UserError if the policy cannot act in the task of this name."""
+        config = self.config
         if config.task and config.task != name:
-            raise UserError(
-                f"{self._name} was trained for {config.task}, not for {name}: add "
-                f"--task {config.task}, or choose another policy"
-            )
+            hint = f"add --task {config.task}, or choose another policy"
+            if config.task not in TASKS:
+                hint = f'run it by touchgoal deploy CELL --task "{config.task}"'
+            raise UserError(f"{self._name} was trained for {config.task}, not for {name}: {hint}")
         if task.arm != "fr3":
             raise UserError(
                 f"{self._name} commands the seven joints of an FR3, the task has a {task.arm}: "

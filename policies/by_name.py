@@ -120,6 +120,6 @@ def follower(env: FrankaTactileEnv) -> WireFollower:
 def load_saved_policy(cell: CellConfig, task: TaskConfig) -> DeployedPolicy:
     """Return the policy on disk that the cell names; UserError if it does not fit."""
     shipped = cell.task.policy == "shipped"
-    directory = SHIPPED_POLICIES[cell.task.name] if shipped else find_policy(cell.task.policy)
+    directory = SHIPPED_POLICIES[cell.task.simulated] if shipped else find_policy(cell.task.policy)
     policy = SavedPolicy(directory)()
-    return DeployedPolicy.for_cell(cell, policy, policy.env_config(task))
+    return DeployedPolicy.for_cell(cell, policy, policy.env_config(task, cell.task.name))

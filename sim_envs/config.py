@@ -360,23 +360,6 @@ ENVS: dict[TaskName, TaskConfig] = {
 
 
 @checked_dataclass
-class TeleoperatorConfig:
-    """Options of keyboard teleoperation: a compliant hand that follows the keys."""
-
-    speed: Positive = 0.025
-    """Speed of the free hand while a key is held, m/s."""
-    turn_speed: Positive = 0.5
-    """Turning speed of the free hand while a key is held, rad/s."""
-    compliance: NotNegative = 2e-3
-    """Speed per force at which the hand yields, m/s per N."""
-    rotational_compliance: NotNegative = 2.0
-    """Speed per torque at which the hand yields, rad/s per Nm."""
-    hold_seconds: Positive = 0.5
-    """Time for which a typed key counts as held, s. A terminal reports no key releases; it repeats
-    a held key after about 0.4 s, and only the last of several."""
-
-
-@checked_dataclass
 class RigConfig:
     """Options of the indenter rig."""
 

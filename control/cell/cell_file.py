@@ -30,17 +30,20 @@ def find_cell_file(path: Path) -> Path:
 
 
 def read_cell_file(
-    path: Path, policy: str = "", sim: bool = False, seed: int | None = None
+    path: Path, policy: str = "", sim: bool = False, seed: int | None = None, task: str = ""
 ) -> CellConfig:
     """Read a cell file: TOML, or the `cell.json` that a twin has written.
 
-    `policy` and `seed` replace the file's, `sim` its arm by a simulated one. UserError as
-    `read_config`, and if the sections do not fit together.
+    `policy`, `seed` and `task` (its name) replace the file's, `sim` its arm by a simulated one.
+    UserError as `read_config`, and if the sections do not fit together.
     """
     cell = read_config(path, CellConfig, "cell file")
     try:
         if policy:
             cell = replace(cell, task=replace(cell.task, policy=policy))
+        if task and task != cell.task.name:
+            renamed = replace(cell.task, name=task, scene=cell.task.simulated, instruction="")
+            cell = replace(cell, task=renamed)
         check(cell)
         if sim:
             cell = replace(cell, arm="sim")

@@ -1,8 +1,11 @@
 """Checks of a cell file across its fields; each UserError names the key."""
 
+from difflib import get_close_matches
+from typing import get_args
+
 import numpy as np
 
-from touchgoal.control.cell.config import CellConfig, ToolSection
+from touchgoal.control.cell.config import CellConfig, SimulatedTask, TaskSection, ToolSection
 from touchgoal.control.cell.limits import cell_box
 from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.tactile.sensor_models import find_sensor
@@ -88,6 +91,19 @@ def _check_tool(tool: ToolSection) -> None:
         )
 
 
+def _check_own_task(task: TaskSection) -> None:
+    """A misspelt name is no task of one's own, and no scripted or shipped policy fits one."""
+    if near := get_close_matches(task.name, get_args(SimulatedTask), 1, cutoff=0.75):
+        raise UserError(
+            f"task.name is {task.name}: did you mean {near[0]}? Else choose another name"
+        )
+    if task.policy in ("expert", "follower", "shipped"):
+        raise UserError(
+            f"task.policy: {task.policy} is for {' and '.join(get_args(SimulatedTask))}; for {task.name!r} "
+            "name a folder that train-policy made, or record demonstrations with record-demos"
+        )
+
+
 def _check_task(cell: CellConfig) -> None:
     task = cell.task
     if task.start is not None and len(task.start) != _JOINTS[cell.arm]:
@@ -95,9 +111,16 @@ def _check_task(cell: CellConfig) -> None:
             f"task.start must be {_JOINTS[cell.arm]} joint positions of the {cell.arm} in rad, "
             f"not {len(task.start)}"
         )
-    if task.name == "pick-place" and task.wires or task.name == "bead-maze" and task.objects:
+    if (
+        task.simulated == "pick-place"
+        and task.wires
+        or task.simulated == "bead-maze"
+        and task.objects
+    ):
         other = "wires" if task.wires else "objects"
-        raise UserError(f"task.{other} does nothing in {task.name}: leave it out")
+        raise UserError(f"task.{other} does nothing in {task.simulated}: leave it out")
+    if task.own:
+        _check_own_task(task)
     if task.policy == "follower" and task.name != "bead-maze":
         raise UserError("task.policy: the follower is for the bead-maze; use expert or a folder")
     if task.policy != "expert":

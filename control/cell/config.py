@@ -4,7 +4,7 @@
 """
 
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast, get_args
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -25,6 +25,7 @@ Exposure = Annotated[float, Field(gt=0, le=100_000)]
 Width = Annotated[float, Field(ge=0, le=0.2)]  # m
 Kelvin = Annotated[int, Field(ge=1000, le=15_000)]
 CameraName = Literal["front", "wrist"]
+SimulatedTask = Literal["pick-place", "bead-maze"]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -109,13 +110,14 @@ class CameraSection:
 class TaskSection:
     """The task."""
 
-    name: Literal["pick-place", "bead-maze"]
-    """Name of the task."""
-    policy: Annotated[str, Field(min_length=1)]
+    name: Annotated[str, Field(min_length=1, max_length=80)]
+    """Name of the task: pick-place, bead-maze, or any other for a task of your own, which is known by its
+    recordings alone: no object, no goal, and the episode ends by key or time."""
+    policy: str = ""
     """Policy: expert (pick-place, from known positions), follower (bead-maze), shipped, a folder that
     train-policy made, or a class of your own (file.py:Class), whose code then runs."""
     instruction: str = ""
-    """Instruction in words, for the record."""
+    """Instruction in words, for the record; default: the name."""
     seconds: Annotated[float, Field(gt=0, le=3600)] = 30.0
     """Time limit of the run, s."""
     start: tuple[Angle, ...] | None = None
@@ -133,6 +135,8 @@ class TaskSection:
     """pick-place on a simulated arm: names of objects to draw from; none: all."""
     wires: tuple[str, ...] = ()
     """bead-maze on a simulated arm: names of wires to draw from; none: all."""
+    scene: SimulatedTask = "pick-place"
+    """Scene of a simulated arm or a twin for a task of your own: that of pick-place or bead-maze."""
     rewards: tuple[str, ...] = ()
     """Goals whose distance is shown and recorded during the run, as those of reward-curves:
     episode:FOLDER#K, image:PATH, text:SENTENCE."""
@@ -145,6 +149,16 @@ class TaskSection:
     give_up: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     """Rise of that distance above its lowest in the run which, kept for a second, ends the run as failed; 0:
     never."""
+
+    @property
+    def own(self) -> bool:
+        """Whether the task is known by its recordings alone."""
+        return self.name not in get_args(SimulatedTask)
+
+    @property
+    def simulated(self) -> SimulatedTask:
+        """Task whose scene a simulated arm stands in."""
+        return self.scene if self.own else cast(SimulatedTask, self.name)
 
 
 @dataclass(frozen=True, config=STRICT)

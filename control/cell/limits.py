@@ -29,11 +29,13 @@ def cell_limits(cell: CellConfig) -> RobotLimits:
                 finger_corners=tool.finger_corners,
             ),
         )
-    forces = TASK_FORCES[cell.task.name]
-    given = {"force": forces.force_ceiling, "torque": forces.torque_ceiling}
+    forces, given, indentation = TASK_FORCES.get(cell.task.name), {}, robot.indentation
+    if forces is not None:
+        given = {"force": forces.force_ceiling, "torque": forces.torque_ceiling}
+        indentation = forces.indentation_ceiling
     if cell.fingertips is not None:
         sensor = find_sensor(cell.fingertips.sensor)
-        given["indentation"] = deepest_readable(sensor, forces.indentation_ceiling)
+        given["indentation"] = deepest_readable(sensor, indentation)
     given |= {
         name: value
         for name in ("tip_speed", "velocity_share", "force", "torque", "indentation")

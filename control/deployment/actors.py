@@ -79,7 +79,9 @@ def make_actor(
     if policy is not None:
         # Waiting makes a run on a simulated arm repeatable on any machine.
         timeout = _SIMULATED_PLAN_TIMEOUT if cell.time_waits else None
-        return RealTimeActor(policy.planner, timeout, ServoLag(safety.limits, safety.dt))
+        # Demonstrations of a task of one's own are recorded as they are deployed, without that lag.
+        lag = None if cell.task.own else ServoLag(safety.limits, safety.dt)
+        return RealTimeActor(policy.planner, timeout, lag)
     if cell.task.policy == "follower":
         return WireFollower(ft.CONTROL_HZ)
     return pick_and_place(_pick_place_poses(cell, truth), safety, commanded)

@@ -80,13 +80,15 @@ class Ending:
         return f"STOPPED: {self.reason}\n  the arm: {rest}\n  what to do: {self.advice}"
 
 
-Request = Literal["", "stop", "done", "not done", "success", "failed"]
-"""Operator's request: go on, stop the arm, end with the task done or not; success: a simulator's;
-failed: the cost's."""
+Request = Literal["", "stop", "done", "not done", "discard", "success", "failed"]
+"""Operator's request: go on, stop the arm, end with the task done or not, or without a record;
+success: a simulator's; failed: the cost's."""
 PLAN_ENDED = "the plan is through"
+STOPPED_BY_OPERATOR, DISCARDED = "stopped by the operator", "discarded by the operator"
 _REQUESTED_ENDINGS: dict[Request, Ending] = {
     "done": Ending("the operator says that the task is done", done=True),
     "not done": Ending("the operator says that the task is not done", done=False),
+    "discard": Ending(DISCARDED),
     "success": Ending("the simulator says that the task is done", done=True),
     "failed": Ending("the cost has risen for a second: the policy has failed", done=False),
 }
@@ -246,7 +248,7 @@ class ControlLoop:
             return ending
         if request := self._operator_request():
             if request == "stop":
-                return self.stop("stopped by the operator", "start deploy again when you are ready")
+                return self.stop(STOPPED_BY_OPERATOR, "start deploy again when you are ready")
             return _REQUESTED_ENDINGS[request]
         asked = time.perf_counter()
         action = np.asarray(actor.act(reading.observation), np.float64)

@@ -139,15 +139,20 @@ def _limits(cell: CellConfig, safety: ActionFilter) -> str:
 
 def _ceilings(cell: CellConfig, safety: ActionFilter) -> str:
     """Return the force ceilings and their source."""
-    task = TASK_FORCES[cell.task.name]
+    task = TASK_FORCES.get(cell.task.name)
     ceilings = ("force", "torque", "indentation")
     own = [name for name in ceilings if getattr(cell.safety, name) is not None]
     source = f"{', '.join(own)} as the cell file says; " if own else ""
     limits = safety.limits
+    demonstrations = "the default of a task of your own" if len(own) < len(ceilings) else ""
+    if task is not None:
+        demonstrations = (
+            f"{task.episodes} demonstrations of {cell.task.name} reach {task.force:g} N and "
+            f"{1e3 * task.indentation:.2g} mm"
+        )
     return (
         f"stops above {limits.force:.3g} N, {limits.torque:.3g} Nm or {1e3 * limits.indentation:.3g} mm into a "
-        f"gel; {source}{task.episodes} demonstrations of {cell.task.name} reach {task.force:g} N and "
-        f"{1e3 * task.indentation:.2g} mm"
+        f"gel; {source}{demonstrations}"
     )
 
 

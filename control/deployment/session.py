@@ -12,6 +12,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import (
+    DISCARDED,
     PLAN_ENDED,
     SLOW_ARM,
     ControlLoop,
@@ -51,7 +52,9 @@ class Result:
     ending: Ending  # how the run ended
     log: RunLog  # its record
     success: bool | None  # whether the task is done, by the simulator or the ending; None: unknown
-    progress: float | None  # of the task in [0, 1], by the simulator; None without one
+    # of the task in [0, 1], by the simulator; for a task of one's own the share of the distance to
+    # its goal that is gone since the start; None without either
+    progress: float | None
     held_width: float | None  # width of the object still in the hand, m; None: no object
     episode: int | None  # index of the recorded episode; None without one
     recording_error: str = ""  # why there is none, if there should be one
@@ -80,7 +83,7 @@ class Session:
         """
         # Scripts end by themselves; for other actors only a simulator knows when the task is done.
         scripted = self.cell.task.policy == "expert"
-        truth = None if scripted else self.connection.truth
+        truth = None if scripted else self._truth
         watch, log = _SuccessWatch(truth, self.cell.time_waits), RunLog()
         loop = ControlLoop(
             self.connection,
@@ -100,7 +103,7 @@ class Session:
             ending = Ending(f"{PLAN_ENDED}, but the hand holds nothing", done=False)
         success = self._success(ending)
         episode, recording_error = None, ""
-        if self.execute and log.rows:
+        if self.execute and log.rows and ending.reason != DISCARDED:
             try:
                 episode = self._record_episode(log, ending, success)
             except (OSError, UserError, MemoryError) as error:
@@ -108,8 +111,13 @@ class Session:
                     f"this episode could not be saved ({error}); those before it are whole"
                 )
         return Result(
-            ending, log, success, self._progress(), self._held_width(), episode, recording_error
+            ending, log, success, self._progress(log), self._held_width(), episode, recording_error
         )
+
+    @property
+    def _truth(self) -> Truth | None:
+        """What a simulator knows; nothing about a task that is known by its recordings alone."""
+        return None if self.cell.task.own else self.connection.truth
 
     def _move_to_start(self, loop: ControlLoop) -> Ending | None:
         """Move to the start pose; the ending if the run cannot go on from there."""
@@ -150,7 +158,7 @@ class Session:
         """Return the outcome; a run that was stopped is no success, whatever the task looks like."""
         if not self.execute:
             return None
-        truth, clock = self.connection.truth, self.connection.clock
+        truth, clock = self._truth, self.connection.clock
         if ending.stopped or truth is None:
             return ending.done
         end = clock.now() + _SETTLE_TIME
@@ -161,12 +169,16 @@ class Session:
             return ending.done
         return success
 
-    def _progress(self) -> float | None:
-        truth = self.connection.truth
+    def _progress(self, log: RunLog) -> float | None:
         try:
-            return None if truth is None else float(truth()["progress"])
+            if self._truth is not None:
+                return float(self._truth()["progress"])
         except UserError:  # the twin has ended
             return None
+        costs = [float(row[ft.COST][0]) for row in log.rows if ft.COST in row]
+        if not self.cell.task.own or not costs or costs[0] <= 0:
+            return None
+        return float(np.clip(1 - costs[-1] / costs[0], 0.0, 1.0))
 
     def _held_width(self) -> float | None:
         try:
@@ -181,6 +193,7 @@ class Session:
         meta: dict[str, Any] = {
             "sensor": cell.sensor,
             "arm": cell.arm,
+            "task": cell.task.name,
             "policy": cell.task.policy,
             "outcome": "stopped" if ending.stopped else outcome,
             "ending": ending.reason,

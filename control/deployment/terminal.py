@@ -3,7 +3,7 @@
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
@@ -24,6 +24,11 @@ _KEY_REQUESTS: dict[str, Request] = {
     " ": "stop",
     "q": "stop",
 }
+RECORDING_HELP = (
+    "space or Ctrl-C stops the arm, Enter ends a success, n a failure, q discards; none is an "
+    "emergency stop"
+)
+_RECORDING_REQUESTS: dict[str, Request] = {**_KEY_REQUESTS, "q": "discard"}
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _TICKS_PER_LINE = 4
 
@@ -40,7 +45,10 @@ def say(text: str) -> None:
 class Terminal:
     """Takes the operator's requests, and shows the state every few ticks."""
 
-    def __init__(self) -> None:
+    def __init__(self, on_keys: Callable[[str], None] | None = None) -> None:
+        """Read keys of a deployment, or those of a recording if `on_keys` takes all that is typed."""
+        self._on_keys = on_keys
+        self._key_requests = _RECORDING_REQUESTS if on_keys else _KEY_REQUESTS
         self._request: Request = ""
         self._tick_count = 0
         keys = sys.stdin if sys.stdin is not None and sys.stdin.isatty() else None
@@ -54,8 +62,10 @@ class Terminal:
                 typed = self._keyboard.read_keys()
             except (KeyboardInterrupt, UserError):  # Ctrl-C, or the terminal has gone
                 typed = " "
+            if self._on_keys is not None:
+                self._on_keys(typed)
             for key in typed:
-                request = _KEY_REQUESTS.get(key)
+                request = self._key_requests.get(key)
                 if request == "stop" or (request and not self._request):
                     self._request = request
         return self._request

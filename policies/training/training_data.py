@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.config import TASKS, TaskName
+from touchgoal.sim_envs.config import TASKS
 
 _READ = (ft.STATE, ft.COMMAND, ft.TCP_POSE, ft.WRENCH, ft.ACTION, *ft.TACTILE)
 _PAUSE = 0.5  # s
@@ -88,17 +88,21 @@ def report_pauses(pauses: Sequence[int], fps: int, trimmed: bool) -> None:
         )
 
 
-def find_task(chosen: Sequence[tuple[EpisodeSet, Sequence[int]]], task: str | None) -> TaskName:
+def find_task(chosen: Sequence[tuple[EpisodeSet, Sequence[int]]], task: str | None) -> str:
     """Return the task of the chosen episodes; it must be `task` if that is given.
+
+    It may be one that no simulator knows.
 
     UserError: they are of several tasks or of another one, or name none and `task` is None.
     """
     root, found = chosen[0][0].root, _common("task", chosen, task_of)
     if task and found not in ("", task):
         raise UserError(f"{root} is of {found}, not of {task}: leave out --task")
-    if (found or task) not in TASKS:
-        raise UserError(f"{root} does not name its task: add --task {' or '.join(TASKS)}")
-    return cast(TaskName, found or task)
+    if not (found or task):
+        raise UserError(
+            f"{root} does not name its task: add --task {', '.join(TASKS)} or a name of your own"
+        )
+    return found or str(task)
 
 
 def check_sensor(recorded: str, tried: str) -> None:

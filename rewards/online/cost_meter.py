@@ -142,7 +142,7 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
         camera=FRONT if FRONT in cameras else None,
         sides=TACTILE if cell.fingertips is not None else (),
         sensor=cell.sensor,
-        scene=f"simulated {cell.task.name}" if simulated else REAL_SCENE,
+        scene=f"simulated {cell.task.simulated}" if simulated else REAL_SCENE,
         cameras=cameras,
         task=cell.task.instruction or cell.task.name,
     )

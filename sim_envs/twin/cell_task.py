@@ -10,7 +10,7 @@ from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfi
 def env_config_of(config: CellConfig) -> TaskConfig:
     """Return the task's options with the cell's sensors, at the rate of a deployment."""
     task: TaskConfig = PickPlaceConfig(objects=config.task.objects)
-    if config.task.name == "bead-maze":
+    if config.task.simulated == "bead-maze":
         task = BeadMazeConfig(wires=config.task.wires)
     return replace(
         task,

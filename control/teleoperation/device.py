@@ -1,0 +1,43 @@
+"""Interface of a teleoperation device: the motion of the hand that a person asks for."""
+
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.features import Observation
+
+DeviceName = Literal["keyboard", "spacemouse", "scripted"]
+GripperRequest = Literal["", "open", "close"]
+Verdict = Literal["", "done", "not done"]
+
+
+@dataclass(frozen=True)
+class HandMotion:
+    """One tick's request; axes of the base frame: x away from the robot, y left, z up."""
+
+    twist: Float[np.ndarray, "6"]
+    """Motion along the axes, then turning about them, as shares of the full speeds in [-1, 1]."""
+    gripper: GripperRequest = ""
+    """Empty: go on as before."""
+
+
+@runtime_checkable
+class TeleoperationDevice(Protocol):
+    """A device that is read once a control tick."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """How the device itself ends the episode; empty while a person must, by key."""
+        ...
+
+    def press(self, keys: str) -> None:
+        """Take what was typed at the terminal."""
+
+    def read(self, observation: Observation) -> HandMotion:
+        """Return the present request without waiting; DriverError if the device has gone."""
+        ...
+
+    def close(self) -> None:
+        """Release the device."""

@@ -1,0 +1,49 @@
+"""Keyboard teleoperation: a typed key pushes or turns the hand for a moment."""
+
+import numpy as np
+
+from touchgoal.control.features import Observation
+from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, Verdict
+
+HELP = "w/s away/back  a/d left/right  r/f up/down  j/l yaw  i/k pitch  u/o roll  g grip  h let go"
+# s: a terminal reports no key releases; it repeats a held key after about 0.4 s, and only the last
+# of several.
+_HOLD_SECONDS = 0.5
+# A pair an axis: the key for its positive direction, and the key for the negative one. Pitch is
+# positive with the nose down.
+_PAIRS = ("ws", "ad", "rf", "ou", "ki", "jl")
+_AXES = {
+    key: sign * axis
+    for pair, axis in zip(_PAIRS, np.eye(6), strict=True)
+    for key, sign in zip(pair, (1, -1), strict=True)
+}
+_GRIPPER: dict[str, GripperRequest] = {"g": "close", "h": "open"}
+
+
+class KeyboardDevice:
+    """Keys as full deflections; `hz` is the rate at which `read` is called."""
+
+    verdict: Verdict = ""
+
+    def __init__(self, hz: float) -> None:
+        self._hold_ticks = round(_HOLD_SECONDS * hz)
+        self._held: dict[str, int] = {}  # ticks left
+        self._gripper: GripperRequest = ""
+
+    def press(self, keys: str) -> None:
+        """Take typed keys, in this order; a key ends its opposite, others have no meaning."""
+        for key in keys:
+            self._gripper = _GRIPPER.get(key, self._gripper)
+            if key in _AXES:
+                pair = next(pair for pair in _PAIRS if key in pair)
+                self._held.pop(pair.replace(key, ""), None)
+                self._held[key] = self._hold_ticks
+
+    def read(self, observation: Observation) -> HandMotion:
+        """Return the sum of the keys that count as held."""
+        twist = sum((_AXES[key] for key in self._held), np.zeros(6))
+        self._held = {key: ticks - 1 for key, ticks in self._held.items() if ticks > 1}
+        return HandMotion(twist, self._gripper)
+
+    def close(self) -> None:
+        """Do nothing: the terminal is another's."""

@@ -1,0 +1,82 @@
+"""The actor of a teleoperated run: the device's motion, and a hand that yields to what it presses on.
+
+Its actions pass the control loop's safety layer like any policy's.
+"""
+
+from collections.abc import Callable
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from touchgoal.control import features as ft
+from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.motion.rotations import rotation_matrix
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.teleoperation.device import TeleoperationDevice
+from touchgoal.runtime.option_types import NotNegative, checked_dataclass
+
+# N and Nm beyond the first reading that count as none: the weight of a carried object, and the drift
+# of an arm's own estimate.
+_FREE_FORCE, _FREE_TORQUE = 3.0, 0.3
+
+
+@checked_dataclass
+class TeleoperationConfig:
+    """Response of the hand to a device."""
+
+    speed: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    """Speed of the hand at full deflection, m/s; a keyboard knows no other."""
+    turn_speed: Annotated[float, Field(gt=0, le=2)] = 0.6
+    """Turning speed of the hand at full deflection, rad/s."""
+    compliance: Annotated[NotNegative, Field(le=0.01)] = 2e-3
+    """Speed per force at which the hand yields beyond 3 N, m/s per N; much more oscillates."""
+    rotational_compliance: Annotated[NotNegative, Field(le=5)] = 0.5
+    """Turning speed per torque at which it yields beyond 0.3 Nm, rad/s per Nm."""
+
+
+class Teleoperator(Actor):
+    """Moves the commanded hand by a device's motions; it never ends by itself."""
+
+    def __init__(
+        self,
+        device: TeleoperationDevice,
+        safety: ActionFilter,
+        commanded: Callable[[], np.ndarray],
+        config: TeleoperationConfig,
+    ) -> None:
+        """Begin at rest; `commanded` returns the joints (rad) commanded now."""
+        self._device, self._commanded, self._config = device, commanded, config
+        self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
+        self._widths = {"close": safety.limits.tool.stroke[0], "open": safety.limits.tool.stroke[1]}
+        self._dt = safety.dt
+
+    def start(self, observation: Observation) -> None:
+        """Take the first wrench as that of the free hand, and the gripper's width as its target."""
+        self._at_rest = observation[ft.WRENCH].astype(np.float64)
+        self._width = float(observation[ft.STATE][-1])
+
+    def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
+        """Return the action for the next tick; joints stand where the arm cannot follow."""
+        motion, config, q = self._device.read(observation), self._config, self._commanded()
+        self._width = self._widths.get(motion.gripper, self._width)
+        added = (observation[ft.WRENCH] - self._at_rest).reshape(2, 3)
+        moved = config.speed * motion.twist[:3]
+        moved = moved + config.compliance * _beyond(added[0], _FREE_FORCE)
+        turned = config.turn_speed * motion.twist[3:]
+        turned = turned + config.rotational_compliance * _beyond(added[1], _FREE_TORQUE)
+        if not moved.any() and not turned.any():
+            return np.append(np.zeros(q.size), self._width)
+        position, R = self._kinematics.forward(q)
+        R = rotation_matrix(self._dt * turned) @ R
+        solved = self._kinematics.solve_ik_near(position + self._dt * moved, R, q)
+        return np.append(solved.q - q if solved.reached else np.zeros(q.size), self._width)
+
+
+def _beyond(vector: Float[np.ndarray, "3"], free: float) -> Float[np.ndarray, "3"]:
+    """Return a vector shortened by `free`; NaN, as near an arm's singularity, counts as none."""
+    length = float(np.linalg.norm(vector))
+    return vector * (1 - free / length) if length > free else np.zeros(3)

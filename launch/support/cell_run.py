@@ -1,0 +1,66 @@
+"""Steps that every command with a moving arm shares: connect, check, record."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from touchgoal.runtime.errors import UserError, require_all_ok
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from touchgoal.control.cell.config import CellConfig
+    from touchgoal.control.cell.connection import CellConnection
+    from touchgoal.control.safety.action_filter import ActionFilter
+
+
+def connect(cell: "CellConfig") -> "CellConnection":
+    """Connect to the cell, once a twin has put its scene back."""
+    from touchgoal.control import features as ft
+    from touchgoal.control.cell.connection import connect_cell
+    from touchgoal.control.cell.twin_client import put_scene_back
+    from touchgoal.control.interfaces import DriverError
+
+    if cell.arm == "sim":
+        from touchgoal.sim_envs.cell.in_process import simulate_cell
+
+        return simulate_cell(cell, ft.CONTROL_HZ)
+    if cell.task.twin:
+        put_scene_back(cell.task.twin, cell.task.seed)
+        print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
+    try:
+        return connect_cell(cell, ft.CONTROL_HZ)
+    except DriverError as error:
+        raise UserError(str(error)) from error
+
+
+def check_cell(cell: "CellConfig", connection: "CellConnection", episodes: Path) -> "ActionFilter":
+    """Print the checks before anything moves; return the safety layer, UserError if one fails.
+
+    `episodes` is the folder that the run records into.
+    """
+    from touchgoal.control import features as ft
+    from touchgoal.control.cell.limits import cell_watchdogs
+    from touchgoal.control.deployment.preflight import preflight
+    from touchgoal.control.safety.action_filter import ActionFilter
+    from touchgoal.episodes.store import EpisodeWriter
+
+    def count_episodes() -> int:
+        return len(EpisodeWriter(episodes, ft.CONTROL_HZ))
+
+    safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
+    print("checks before anything moves:", flush=True)
+    results = preflight(cell, connection, safety, episodes, count_episodes)
+    print("\n".join(map(str, results)), flush=True)
+    require_all_ok(results)
+    return safety
+
+
+def record_episode(
+    episodes: Path, frames: "dict[str, np.ndarray]", task: str, meta: dict[str, Any]
+) -> int:
+    """Add an episode to the folder and return its index; see `session.RecordEpisode`."""
+    from touchgoal.control import features as ft
+    from touchgoal.episodes.schema import Episode
+    from touchgoal.episodes.store import EpisodeWriter
+
+    return EpisodeWriter(episodes, ft.CONTROL_HZ).append(Episode(frames, task, meta))
