@@ -36,6 +36,7 @@ TOY = {
     "train-encoder words": "--surfaces 4 --heads.epochs 1 --encoder gelsight_mini_surfaces",
     "train-encoder surfaces": "--surfaces 16 --presses-per-surface 2",
     "train-policy": "--head tiny --train.epochs 1 --trials 0 --workers 1",
+    "record-demos": "--episodes 1 --yes",
     "twin": "--port 0 --lock-step",
     "deploy": "--yes",
 }
@@ -48,7 +49,6 @@ NOT_RUN = {
     "arm": "needs an arm: test_arm_commands.py",
     "push": "needs a hub: test_hub.py",
     "pull": "needs a hub: test_hub.py",
-    "teleop": "needs a terminal and a person: test_teleop.py",
     "benchmark": "test_commands.py runs each at toy size",
     "make-policy": "test_commands.py",
     "demo": "test_commands.py",

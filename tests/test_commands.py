@@ -145,17 +145,6 @@ def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert "add: --task bead-maze" in message and not (tmp_path / "c").exists()
 
 
-def test_teleop_needs_a_terminal(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With a terminal: test_teleop.py."""
-    out = tmp_path / "out"
-    monkeypatch.setattr("sys.stdin", open(os.devnull))
-    assert "in a terminal" in refused(capsys, "teleop", "--out", out)
-    assert "unknown wire" in refused(capsys, "teleop", "--env.wires", "knot-1", "--out", out)
-    assert not out.exists()
-
-
 @pytest.mark.slow
 def test_learning_the_bead_maze(
     tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch

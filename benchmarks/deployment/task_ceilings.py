@@ -26,7 +26,7 @@ class Config(BenchmarkOptions):
     """Options of benchmark task-ceilings."""
 
     data: Path = field(kw_only=True)
-    """Folder of an expert's or teleoperator's episodes; the gel's ceiling needs tactile images."""
+    """Folder of an expert's or a person's episodes; the gel's ceiling needs tactile images."""
 
 
 def peak_force(episode: Episode) -> float:

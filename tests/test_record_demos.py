@@ -1,0 +1,283 @@
+"""Demonstrations of a task of one's own: devices, recording, training, deployment, by no simulator's truth."""
+
+import json
+import os
+import select
+import socket
+import struct
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from touchgoal.control import features as ft
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.deployment.scripted import PickPlacePoses
+from touchgoal.control.deployment.terminal import Terminal
+from touchgoal.control.interfaces import DriverError
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.motion.rotations import rotation_vector
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.safety.limits import FR3
+from touchgoal.control.sensors.keyboard import Keyboard
+from touchgoal.control.teleoperation.device import HandMotion
+from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
+from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
+from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
+from touchgoal.control.teleoperation.teleoperator import TeleoperationConfig, Teleoperator
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.launch import record_demos
+from touchgoal.launch.__main__ import main
+from touchgoal.launch.deploy import NOT_DONE
+from touchgoal.runtime.errors import UserError
+
+OBSERVED: dict = {}
+HZ, TICK = 20.0, 0.05
+
+
+# The published table of reports (PySpaceMouse, devices.toml): axis -> report, first byte.
+WIRED = {"x": (1, 1), "y": (1, 3), "z": (1, 5), "rx": (2, 1), "ry": (2, 3), "rz": (2, 5)}
+WIRELESS = {"x": (1, 1), "y": (1, 3), "z": (1, 5), "rx": (1, 7), "ry": (1, 9), "rz": (1, 11)}
+# And its convention with z up: x right, y away from the user, z up; rotations about them.
+Z_UP = {"x": (0, 1), "y": (1, -1), "z": (2, -1), "rx": (3, 1), "ry": (4, -1), "rz": (5, -1)}
+
+
+def plug_in(folder: Path, product: str) -> tuple[Path, Path]:
+    """A made-up /sys and /dev with a mouse of another maker and a SpaceMouse."""
+    for name, identity in (("hidraw0", "0003:0000046D:0000C077"), ("hidraw1", product)):
+        node = folder / "sys" / name / "device"
+        node.mkdir(parents=True)
+        (node / "uevent").write_text(f"DRIVER=hid-generic\nHID_ID={identity}\nHID_NAME=x\n")
+    (folder / "dev").mkdir()
+    os.mkfifo(folder / "dev" / "hidraw1")
+    return folder / "sys", folder / "dev"
+
+
+@pytest.mark.parametrize(
+    ("product", "table", "length"),
+    [("0003:0000256F:0000C635", WIRED, 7), ("0003:0000256F:0000C62E", WIRELESS, 13),
+     ("0003:0000046D:0000C626", WIRED, 7)],
+)  # fmt: skip
+def test_a_spacemouse_is_read_as_its_reports_are_documented(
+    product: str, table: dict, length: int, tmp_path: Path
+) -> None:
+    with closing(SpaceMouse(*plug_in(tmp_path, product))) as mouse:
+        assert not mouse.read(OBSERVED).twist.any()
+        for axis, (report, first) in table.items():
+            for count, share in ((350, 1.0), (-175, -0.5), (1000, 1.0), (10, 0.0)):
+                content = bytearray(length)
+                content[0] = report
+                content[first : first + 2] = struct.pack("<h", count)
+                for other in {1, 2} - {report}:
+                    mouse.take(bytes([other, *bytes(length - 1)]))
+                mouse.take(bytes(content))
+                mouse._heard = np.inf  # noqa: SLF001
+                index, sign = Z_UP[axis]
+                right_away_up = np.zeros(6)
+                right_away_up[index] = sign * share
+                for part in (0, 3):  # base: x away from the robot and its operator, y left, z up
+                    right, away, up = right_away_up[part : part + 3]
+                    np.testing.assert_allclose(
+                        mouse.read(OBSERVED).twist[part : part + 3], [away, -right, up]
+                    )
+        mouse.take(bytes([3, 1, 0]))
+        assert mouse.read(OBSERVED).gripper == "close"
+        mouse.take(bytes([3, 0, 0]))  # let go of: the hand stays closed
+        assert mouse.read(OBSERVED).gripper == "close"
+        mouse.take(bytes([3, 2, 0]))
+        assert mouse.read(OBSERVED).gripper == "open"
+
+
+def test_a_silent_spacemouse_is_at_rest_and_an_unplugged_one_is_said(tmp_path: Path) -> None:
+    mouse = SpaceMouse(*plug_in(tmp_path, "0003:0000256F:0000C635"))
+    ours, device = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)  # a report a read
+    os.close(mouse._file)  # noqa: SLF001
+    device.setblocking(False)
+    mouse._file = device.detach()  # noqa: SLF001
+    for z in (100, -350):
+        ours.send(struct.pack("<B3h", 1, 0, 0, z))
+    assert mouse.read(OBSERVED).twist.tolist() == [
+        0,
+        0,
+        1,
+        0,
+        0,
+        0,
+    ]  # the newest: the cap is lifted
+    mouse._heard -= 1.0  # noqa: SLF001
+    assert not mouse.read(OBSERVED).twist.any()
+    mouse.close()
+    with pytest.raises(DriverError, match="plug it in"):
+        mouse.read(OBSERVED)
+    with pytest.raises(UserError, match="no SpaceMouse is plugged in"):
+        find_spacemouse(tmp_path / "dev")
+
+
+def test_keys_are_held_for_a_moment_and_end_their_opposites() -> None:
+    keyboard = KeyboardDevice(HZ)
+    keyboard.press("wrx\x1b[A")  # the last ones mean nothing
+    assert keyboard.read(OBSERVED).twist.tolist() == [1, 0, 1, 0, 0, 0]
+    keyboard.press("sjg")
+    motion = keyboard.read(OBSERVED)
+    assert motion.twist.tolist() == [-1, 0, 1, 0, 0, 1] and motion.gripper == "close"
+    for _ in range(10):
+        motion = keyboard.read(OBSERVED)
+    assert not motion.twist.any() and motion.gripper == "close"
+
+
+class Pushed:
+    """A device that asks for one motion for ever, and then says that it is done."""
+
+    def __init__(self, twist: list[float], ticks: float = np.inf) -> None:
+        self.twist, self.ticks, self.verdict = np.array(twist, float), ticks, ""
+
+    def press(self, keys: str) -> None: ...
+
+    def read(self, observation: dict) -> HandMotion:
+        self.ticks -= 1
+        self.verdict = "" if self.ticks > 0 else "done"
+        return HandMotion(self.twist, "close")
+
+    def close(self) -> None: ...
+
+
+def act(twist: list[float], wrench: tuple[float, ...] = (0.0,) * 6) -> tuple[np.ndarray, ...]:
+    """What an action moves (m) and turns (rad, base frame), and the gripper's width."""
+    config = TeleoperationConfig(speed=0.1, turn_speed=0.4, compliance=2e-3)
+    kinematics = Kinematics(FR3.arm, FR3.tool.tcp_offset)
+    q = FR3.arm.home
+    hand = Teleoperator(Pushed(twist), ActionFilter(FR3, HZ), lambda: q, config)
+    first = {ft.WRENCH: np.full(6, 1.0, np.float32), ft.STATE: np.full(15, 0.05, np.float32)}
+    hand.start(first)
+    action = hand.act({**first, ft.WRENCH: np.float32(1.0) + np.array(wrench, np.float32)})
+    (before, R), (after, turned) = kinematics.forward(q), kinematics.forward(q + action[:-1])
+    return after - before, rotation_vector(turned @ R.T), action[-1:]
+
+
+def test_the_hand_moves_as_asked_and_yields_to_what_it_presses_on() -> None:
+    moved, turned, width = act([1, -0.5, 0, 0, 0, 0])
+    np.testing.assert_allclose(moved, [0.1 * TICK, -0.05 * TICK, 0], atol=1e-5)
+    np.testing.assert_allclose([*turned, *width], 0, atol=1e-4)
+    moved, turned, _ = act([0, 0, 0, 0, 0, 1])
+    np.testing.assert_allclose(turned, [0, 0, 0.4 * TICK], atol=1e-4)
+    np.testing.assert_allclose(moved, 0, atol=1e-5)
+    assert not np.any(act([0] * 6, (0, 0, 2.9, 0, 0, 0.2)))  # what a carried object weighs
+    moved, _, _ = act([0, 0, -0.2, 0, 0, 0], (0, 0, 10.0, 0, 0, 0))
+    np.testing.assert_allclose(moved, [0, 0, TICK * (2e-3 * 7 - 0.02)], atol=1e-5)
+
+
+def test_the_script_picks_places_and_says_how_it_ended() -> None:
+    """In free space, with a hand that goes where it is asked and closes on 40 mm."""
+    position, width = np.array([0.4, 0.1, 0.3]), 0.08
+    device = ScriptedDevice(PickPlacePoses((0.5, 0.0, 0.03, 0.0), (0.5, -0.1)))
+    closed_at = None
+    for _ in range(1000):
+        state = np.zeros(15, np.float32)
+        state[-1] = width
+        pose = np.array([*position, 0.0, 1.0, 0.0, 0.0], np.float32)  # fingers down
+        motion = device.read({ft.TCP_POSE: pose, ft.STATE: state})
+        assert np.abs(motion.twist).max() <= 1
+        position = position + 0.1 * TICK * motion.twist[:3]
+        width = max(0.04, width - 0.01) if motion.gripper == "close" else 0.08
+        if closed_at is None and width == 0.04:
+            closed_at = position.copy()
+        if device.verdict:
+            break
+    assert device.verdict == "done" and closed_at is not None
+    np.testing.assert_allclose(closed_at, [0.5, 0.0, 0.03], atol=0.005)
+    np.testing.assert_allclose(position, [0.5, -0.1, 0.03], atol=0.005)
+
+
+CELL = """
+arm = "sim"
+gripper = { kind = "franka_hand" }
+task = { name = "put it down", objects = ["golf_ball"], seconds = 2.0 }
+"""
+
+
+def test_own_demonstrations_train_a_policy_that_deploys(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At toy size: nothing is any good, and nothing knows more than the cell's sensors."""
+    cell = tmp_path / "cell.toml"
+    cell.write_text(CELL)
+    monkeypatch.setattr(
+        record_demos, "_open_device", lambda *_: Pushed([0, 0, -0.5, 0, 0, 0], ticks=20)
+    )
+    for name, seed in (("train", 0), ("validation", 100_000)):
+        episodes = 2 if name == "train" else 1
+        run("record-demos", cell, "--device", "scripted", "--episodes", episodes, "--seed", seed,
+            "--yes", "--out", tmp_path / name)  # fmt: skip
+    found = EpisodeSet(tmp_path / "train" / "episodes")
+    assert len(found) == 2 and not any(key.startswith("truth.") for key in found.features)
+    frames, meta = found.read(0).frames, found.meta(0)
+    assert meta["task"] == "put it down" and meta["success"] and meta["policy"] == "scripted"
+    assert frames[ft.TCP_POSE][-1, 2] < frames[ft.TCP_POSE][0, 2] - 0.02
+    assert (frames[ft.ACTION][:, -1] == 0).all()
+    said = json.loads((tmp_path / "train" / "metrics.json").read_text())["episodes"]
+    assert len(said) == 2 and said[0]["progress"] is None  # no simulator is asked
+    run("train-policy", "--data", tmp_path / "train" / "episodes", "--validation",
+        tmp_path / "validation" / "episodes", "--head", "tiny", "--train.epochs", 1, "--workers", 1,
+        "--out", tmp_path / "mine")  # fmt: skip
+    assert "no simulator knows 'put it down'" in capsys.readouterr().out
+    deploying = ["deploy", cell, "--policy", tmp_path / "mine", "--execute", "--yes"]
+    with pytest.raises(SystemExit) as end:
+        run(*deploying, "--out", tmp_path / "run")
+    assert end.value.code == NOT_DONE  # time was up
+    assert EpisodeSet(tmp_path / "run" / "episodes").meta(0)["task"] == "put it down"
+    with pytest.raises(SystemExit, match="was trained for put it down, not for pick-place"):
+        run(*deploying, "--task", "pick-place")
+
+
+def run(*arguments: object) -> None:
+    main([str(a) for a in arguments])
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ('name = "pick_place"', "task.name is pick_place: did you mean pick-place?"),
+        ('name = "plug", policy = "expert"', "task.policy: expert is for pick-place and bead-maze"),
+    ],
+)
+def test_a_misspelt_task_or_a_policy_of_another_is_refused(
+    task: str, message: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "cell.toml"
+    file.write_text(f'arm = "sim"\ngripper = {{ kind = "franka_hand" }}\ntask = {{ {task} }}\n')
+    with pytest.raises(UserError, match=message):
+        read_cell_file(file)
+
+
+def test_recording_needs_a_person_and_their_keys_reach_the_device(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = tmp_path / "cell.toml"
+    cell.write_text(CELL)
+    monkeypatch.setattr("sys.stdin", open(os.devnull))
+    with pytest.raises(SystemExit, match="nobody is there to lead the arm"):
+        run("record-demos", cell, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    end, slave = os.openpty()
+    with os.fdopen(slave) as stream:
+        monkeypatch.setattr("sys.stdin", stream)
+        device = KeyboardDevice(HZ)
+        terminal = Terminal(device.press)
+        with terminal.watching():
+            os.write(end, b"wq")
+            select.select([slave], [], [], 5)
+            assert terminal.operator_request() == "discard"
+    assert device.read(OBSERVED).twist[0] == 1
+    os.close(end)
+
+
+def test_a_terminal_that_goes_is_said() -> None:
+    end, terminal = os.openpty()
+    with os.fdopen(terminal) as stream, Keyboard(stream) as keyboard:
+        os.write(end, b"w d")
+        select.select([terminal], [], [], 5)
+        assert keyboard.read_keys() == "w d" and keyboard.read_keys() == ""
+        os.close(end)
+        with pytest.raises(UserError, match="the terminal has gone"):
+            keyboard.read_keys()
