@@ -103,7 +103,7 @@ def main(config: Config) -> None:
         )
     errors = report.held_out_errors(judged, test)
     print(report.errors_table(errors, len(test)))
-    report.refuse_useless(errors)
+    report.require_better_than_background(errors)
     depth = depth_errors(judged.calibration, test, judged.fit_circles(test))
     depths = report.median_by_ball(depth, test.ball_radius)
     print(report.depth_table(depths))

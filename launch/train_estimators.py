@@ -60,7 +60,7 @@ def main(config: Config) -> None:
         load_network,
         save_estimator,
     )
-    from touchgoal.policies.training.model_selection import add_parts
+    from touchgoal.policies.training.model_selection import copy_parts
     from touchgoal.runtime import seeds
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.json_file import write_json
@@ -103,7 +103,7 @@ def main(config: Config) -> None:
     errors |= training.pose_errors(network.pose_estimator, others)
     save_estimator(network, out / "estimator", provenance | {"errors": errors})
     if encoder.resolve() != pretrained.DEFAULT_ENCODER.resolve():
-        add_parts(out / "estimator", {"touch": encoder})
+        copy_parts(out / "estimator", {"touch": encoder})
     write_json(out / "metrics.json", errors)
     print(f"contact: wrong in {errors['contact']:.2%} of ticks")
     for name, (middle, most) in list(errors.items())[1:]:

@@ -123,7 +123,7 @@ def main(config: Config) -> None:
     from touchgoal.policies.perception.frozen_touch import load_touch
     from touchgoal.policies.perception.state_estimation import load_estimator
     from touchgoal.policies.training import training_data
-    from touchgoal.policies.training.model_selection import add_parts, score, select
+    from touchgoal.policies.training.model_selection import copy_parts, score, select
     from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
     from touchgoal.policies.training.train import POLICY, train
     from touchgoal.runtime.errors import UserError
@@ -168,7 +168,7 @@ def main(config: Config) -> None:
     train(policy, windows, validation, config.train, out, config, provenance)
     if not is_first_process():
         return
-    add_parts(out / POLICY, parts)
+    copy_parts(out / POLICY, parts)
     if env is not None and trials:
         scores = select(out, parts, lambda d: score(d, env, trials, config.workers))
         write_json(out / "metrics.json", {"snapshots": scores})

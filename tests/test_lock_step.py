@@ -15,7 +15,7 @@ from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.cell_file import EXAMPLES
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import connect_cell
-from touchgoal.control.cell.twin_client import connect_control_port, put_scene_back
+from touchgoal.control.cell.twin_client import connect_control_port, reset_scene
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime import seeds
@@ -27,7 +27,7 @@ _SMALL = "--env.objects wooden_block --env.cameras front --env.camera-size 96 96
 
 def swing(cell: CellConfig, pause: float) -> list[np.ndarray]:
     """Return all readings of each tick while the arm swings and the hand closes."""
-    put_scene_back(cell.task.twin, cell.task.seed)
+    reset_scene(cell.task.twin, cell.task.seed)
     connection, seen = connect_cell(cell, ft.CONTROL_HZ), []
     q = connection.arm.read().q
     for k in range(_TICKS):

@@ -18,7 +18,12 @@ from touchgoal.encoders.ssl import train
 from touchgoal.encoders.ssl.config import DINO_PRESETS, DinoConfig
 from touchgoal.encoders.ssl.dino import Dino
 from touchgoal.encoders.ssl.frames import sample_frames
-from touchgoal.encoders.ssl.masks import cover, cut, draw_blocks, draw_targets
+from touchgoal.encoders.ssl.masks import (
+    draw_blocks,
+    draw_equal_counts,
+    draw_targets,
+    union_of_blocks,
+)
 from touchgoal.encoders.ssl.self_distillation import SelfDistillation
 from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.ssl.validation import token_statistics
@@ -105,11 +110,11 @@ def test_weight_decay_goes_along_a_cosine_for_matrices_alone() -> None:
 
 
 def test_what_is_seen_is_not_asked_for() -> None:
-    within = cover(draw_blocks((8, 10), (8, 9), 50, 1, rng()), 80)
+    within = union_of_blocks(draw_blocks((8, 10), (8, 9), 50, 1, rng()), 80)
     ids, left = draw_targets((8, 10), (4, 4), 50, 4, within, 10, rng(1))
     assert left.sum(1).min() >= 10
     assert not left.gather(1, ids.flatten(1)).any() and (within | ~left).all()
-    seen = cut(left, rng(2))
+    seen = draw_equal_counts(left, rng(2))
     assert seen.shape == (50, left.sum(1).min())
     assert left.gather(1, seen).all() and (seen.diff(dim=1) > 0).all()
     with pytest.raises(

@@ -116,7 +116,7 @@ def depth_table(depths: dict[str, dict[str, float]]) -> str:
     )
 
 
-def refuse_useless(errors: dict[str, PictureErrors]) -> None:
+def require_better_than_background(errors: dict[str, PictureErrors]) -> None:
     """Raise UserError unless the fit beats the background on held-out pictures."""
     alone = errors["background alone"]["l1_near"]
     best = min(e["l1_near"] for name, e in errors.items() if name != "background alone")

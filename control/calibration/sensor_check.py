@@ -96,7 +96,7 @@ def check_sensor(
     before: Picture | None = first
     background = first.astype(np.float32)
     for frame in frames:
-        if picture_guard.seam(frame):
+        if picture_guard.find_seam(frame):
             torn += 1
             continue
         dots.follow(frame)

@@ -48,7 +48,7 @@ def ask_twin(address: str, line: str) -> dict[str, Any]:
     return answer
 
 
-def put_scene_back(address: str, seed: int) -> None:
+def reset_scene(address: str, seed: int) -> None:
     """Once a twin's arm rests, put arm, hand and objects to the start of a seed's episode.
 
     UserError if the arm keeps moving, another program drives it, or there is no twin.

@@ -8,7 +8,7 @@ from jaxtyping import Float32, UInt8
 
 from touchgoal.control.arrays import Picture
 from touchgoal.control.interfaces import Camera, DriverError, Frame
-from touchgoal.control.tactile.picture_guard import seam
+from touchgoal.control.tactile.picture_guard import find_seam
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_WEDGE, SensorModel
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Corners
@@ -58,7 +58,7 @@ class TactileCamera:
         raw = self._camera.read()
         if self._raw is not raw:
             frame = replace(raw, image=crop_to_sensor(raw.image, self._model, self._crop))
-            self._raw, self._torn = raw, seam(frame.image)
+            self._raw, self._torn = raw, find_seam(frame.image)
             if not self._torn:
                 self._whole = frame
         if self._whole is None:

@@ -70,7 +70,7 @@ def match(
     assert best is not None
     # The rest that the map leaves is smooth, too: predict it from neighbouring dots.
     off = (spots[best.spot] - best.expected).reshape(shape)
-    bent = spread(off, best.found.reshape(shape[:2])).reshape(-1, 2)
+    bent = average_neighbours(off, best.found.reshape(shape[:2])).reshape(-1, 2)
     final = _nearest(best.expected + bent, spots, _REACH * spacing)
     positions = np.where(final.found[:, None], spots[final.spot], final.expected)
     return positions.reshape(shape), final.found.reshape(shape[:2])
@@ -83,7 +83,7 @@ def _starts(places: list[Points], spots: Spots, spacing: float) -> Iterator[Poin
     yield from places[1:]
 
 
-def spread(field: Dots, known: Flags) -> Dots:
+def average_neighbours(field: Dots, known: Flags) -> Dots:
     """Average a field over known neighbours, the nearest counting most."""
     weight = known.astype(np.float32)
     total = cv2.GaussianBlur(field * weight[..., None], (0, 0), 1.0, borderType=cv2.BORDER_CONSTANT)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from touchgoal.control.arrays import AnyPicture, Picture
-from touchgoal.control.tactile.marker_matching import Dots, Flags, Spots, match, spread
+from touchgoal.control.tactile.marker_matching import Dots, Flags, Spots, average_neighbours, match
 from touchgoal.control.tactile.sensor_models import MarkerGrid
 from touchgoal.runtime.errors import UserError
 
@@ -75,7 +75,7 @@ class MarkerTracker:
         height, width, _ = frame.shape
         positions, found = match(starts, centres, self._spacing, (width, height))
         if found.any():
-            moved = spread(positions - self.rest.positions, found)
+            moved = average_neighbours(positions - self.rest.positions, found)
             positions[~found] = (self.rest.positions + moved)[~found]
         self._motion = positions - before
         self.now = Markers(positions, found)

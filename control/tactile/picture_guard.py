@@ -83,7 +83,7 @@ _MOVES = [(x, y, 0, 0) for x, y in product((0.926, 1, 1.08), repeat=2) if (x, y)
 _MOVES += [(1, 1, x, y) for x, y in product((-6, -3, 0, 3, 6), repeat=2) if (x, y) != (0, 0)]
 
 
-def seam(picture: Picture) -> str:
+def find_seam(picture: Picture) -> str:
     """Return where half a row or column steps away, as if torn or rolled; "" if it is whole."""
     for name, lines in (("row", picture), ("column", np.swapaxes(picture, 0, 1))):
         count = lines.shape[0]
@@ -107,7 +107,7 @@ def check_untouched(picture: Picture, sensor: SensorModel, name: str) -> None:
     UserError if it is torn or rolled, its channels are exchanged, or it is mirrored, stretched or
     shifted.
     """
-    if fault := seam(picture) or _fault(_compare(picture, sensor)):
+    if fault := find_seam(picture) or _fault(_compare(picture, sensor)):
         raise UserError(
             f"{name} is no picture of a {sensor.name} as its sensor file shows it: {fault}"
         )

@@ -9,8 +9,14 @@ from torch import Tensor
 
 from touchgoal.encoders.backbones.vit import patch_grid
 from touchgoal.encoders.ssl.config import IJepaConfig
-from touchgoal.encoders.ssl.masks import cover, cut, draw_blocks, draw_size, draw_targets
-from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, take
+from touchgoal.encoders.ssl.masks import (
+    draw_blocks,
+    draw_equal_counts,
+    draw_size,
+    draw_targets,
+    union_of_blocks,
+)
+from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, gather_tokens
 
 _SQUARE = 1.0, 1.0
 
@@ -26,19 +32,19 @@ class IJepa(JointEmbeddingPrediction):
         """
         config, grid = self.config, patch_grid(self.backbone.config.vit)
         size = draw_size(grid, config.context_scale, _SQUARE, generator)
-        context = cover(draw_blocks(grid, size, count, 1, generator), grid[0] * grid[1])
+        context = union_of_blocks(draw_blocks(grid, size, count, 1, generator), grid[0] * grid[1])
         aspect = config.shortest, config.tallest
         size = draw_size(grid, config.target_scale, aspect, generator)
         target, left = draw_targets(
             grid, size, count, config.target_blocks, context, self.min_context, generator
         )
-        return {"context_ids": cut(left, generator), "target_ids": target}
+        return {"context_ids": draw_equal_counts(left, generator), "target_ids": target}
 
     def forward(
         self, touch: Tensor, context_ids: Int[Tensor, "b k"], target_ids: Int[Tensor, "b m j"]
     ) -> dict[str, Float[Tensor, ""]]:
         """Return the loss: smooth L1 distance of predicted and actual tokens, as released."""
         images = self.stacked(touch)
-        actual = take(self.targets(images), target_ids)
+        actual = gather_tokens(self.targets(images), target_ids)
         predicted = self.predict(self.backbone.vit.embed_patches(images), context_ids, target_ids)
         return {"loss": F.smooth_l1_loss(predicted, actual)}

@@ -46,12 +46,14 @@ def draw_blocks(
     return (rows * grid[1] + columns).flatten(2)
 
 
-def cover(ids: Int[Tensor, "b m k"], patches: int) -> Bool[Tensor, "b {patches}"]:
+def union_of_blocks(ids: Int[Tensor, "b m k"], patches: int) -> Bool[Tensor, "b {patches}"]:
     """Return whether each patch of an image is in one of its blocks."""
     return torch.zeros(len(ids), patches, dtype=torch.bool).scatter(1, ids.flatten(1), True)
 
 
-def cut(allowed: Bool[Tensor, "b n"], generator: torch.Generator) -> Int[Tensor, "b k"]:
+def draw_equal_counts(
+    allowed: Bool[Tensor, "b n"], generator: torch.Generator
+) -> Int[Tensor, "b k"]:
     """Draw as many of the allowed patches of each image as the image with the fewest has."""
     fewest = int(allowed.sum(1).min())
     chance = torch.rand(allowed.shape, generator=generator).masked_fill(~allowed, -1.0)
@@ -75,7 +77,7 @@ def draw_targets(
     """
     ids = draw_blocks(grid, size, count, blocks, generator)
     for _ in range(_TRIES):
-        left = within & ~cover(ids, within.shape[1])
+        left = within & ~union_of_blocks(ids, within.shape[1])
         poor = left.sum(1) < least
         if not poor.any():
             return ids, left

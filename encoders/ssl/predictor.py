@@ -81,7 +81,9 @@ class JointEmbeddingPrediction(SelfDistillation):
         return predicted.unflatten(0, target_ids.shape[:2]).float()
 
 
-def take(tokens: Float[Tensor, "b n d"], ids: Int[Tensor, "b m j"]) -> Float[Tensor, "b m j d"]:
+def gather_tokens(
+    tokens: Float[Tensor, "b n d"], ids: Int[Tensor, "b m j"]
+) -> Float[Tensor, "b m j d"]:
     """Return the tokens of sets of patches."""
     index = ids.flatten(1)[:, :, None].expand(-1, -1, tokens.shape[2])
     return tokens.gather(1, index).unflatten(1, ids.shape[1:])

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from touchgoal.encoders.backbones.vit import patch_grid
 from touchgoal.encoders.ssl.config import VJepaConfig
-from touchgoal.encoders.ssl.masks import cover, cut, draw_size, draw_targets
-from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, take
+from touchgoal.encoders.ssl.masks import draw_equal_counts, draw_size, draw_targets, union_of_blocks
+from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, gather_tokens
 
 
 class VJepa(JointEmbeddingPrediction):
@@ -36,8 +36,8 @@ class VJepa(JointEmbeddingPrediction):
             aspect = config.shortest, config.tallest
             size = draw_size(grid, (scale, scale), aspect, generator)
             hidden, left = draw_targets(grid, size, count, blocks, everything, 1, generator)
-            target = cut(cover(hidden, everything.shape[1]), generator)
-            context = cut(left, generator)
+            target = draw_equal_counts(union_of_blocks(hidden, everything.shape[1]), generator)
+            context = draw_equal_counts(left, generator)
             drawn["context_ids"].append(tubes(context, times, everything.shape[1]))
             drawn["target_ids"].append(tubes(target, times, everything.shape[1])[:, None])
         return drawn
@@ -52,7 +52,7 @@ class VJepa(JointEmbeddingPrediction):
         images = self.stacked(touch)
         targets, patches = self.targets(images), self.backbone.vit.embed_patches(images)
         losses = [
-            F.l1_loss(self.predict(patches, context, target), take(targets, target))
+            F.l1_loss(self.predict(patches, context, target), gather_tokens(targets, target))
             for context, target in zip(context_ids, target_ids, strict=True)
         ]
         return {"loss": torch.stack(losses).mean()}

@@ -17,7 +17,7 @@ def connect(cell: "CellConfig") -> "CellConnection":
     """Connect to the cell, once a twin has put its scene back."""
     from touchgoal.control import features as ft
     from touchgoal.control.cell.connection import connect_cell
-    from touchgoal.control.cell.twin_client import put_scene_back
+    from touchgoal.control.cell.twin_client import reset_scene
     from touchgoal.control.interfaces import DriverError
 
     if cell.arm == "sim":
@@ -25,7 +25,7 @@ def connect(cell: "CellConfig") -> "CellConnection":
 
         return simulate_cell(cell, ft.CONTROL_HZ)
     if cell.task.twin:
-        put_scene_back(cell.task.twin, cell.task.seed)
+        reset_scene(cell.task.twin, cell.task.seed)
         print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
     try:
         return connect_cell(cell, ft.CONTROL_HZ)

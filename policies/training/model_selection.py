@@ -19,12 +19,12 @@ def select(
 ) -> dict[str, Score]:
     """Try every snapshot of a run on validation tasks, and make the best one its policy.
 
-    `parts` are the folders beside every policy, see `add_parts`. Returns the score of every
+    `parts` are the folders beside every policy, see `copy_parts`. Returns the score of every
     snapshot; among equals the later one wins.
     """
     scores: dict[str, Score] = {}
     for snapshot in sorted((run / SNAPSHOTS).iterdir()):
-        add_parts(snapshot, parts)
+        copy_parts(snapshot, parts)
         scores[snapshot.name] = trial(snapshot)
         print(
             f"{snapshot.name}: success {scores[snapshot.name][0]:.0%}, "
@@ -45,7 +45,7 @@ def score(policy: Path, env: TaskConfig, trials: int, workers: int) -> Score:
     return result.rate.successes / trials, result.progress
 
 
-def add_parts(policy: Path, parts: Mapping[str, Path]) -> None:
+def copy_parts(policy: Path, parts: Mapping[str, Path]) -> None:
     """Copy folders beside a policy's weights, by name: its touch encoder, its state estimator."""
     for name, folder in parts.items():
         shutil.copytree(folder, policy / name, dirs_exist_ok=True)

@@ -25,7 +25,7 @@ _ALPHA = 0.5  # share of the way to the line through baseline and sentence
 
 
 @runtime_checkable  # beartype checks arguments in tests
-class SeesProgress(Protocol):
+class ProgressEstimator(Protocol):
     """A `Value`, without the network library that it needs."""
 
     def progress(self, cameras: Mapping[str, CameraFeatures]) -> Float[np.ndarray, " n"]:
@@ -51,7 +51,7 @@ def compute_curves(
     episode: EmbeddedEpisode,
     goal: EmbeddedGoal,
     normalizer: DistanceNormalizer | None,
-    value: SeesProgress | None = None,
+    value: ProgressEstimator | None = None,
     before: Mapping[str, float] | None = None,
 ) -> Curves:
     """Return the curves of one trajectory to one goal; without a normalizer raw, and none fused.

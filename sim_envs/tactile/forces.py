@@ -279,7 +279,7 @@ def force_field(
     return ForceField(normal, tangential, slipping, slip_fraction, pitch, press.displacement)
 
 
-def over_picture(
+def resample_to_image(
     values: Float[np.ndarray, "h w"], field: ForceField, picture: Grid
 ) -> Float32[np.ndarray, "h2 w2"]:
     """Interpolate values on a field's cells onto a grid centred on the image; 0 beyond the gel."""
@@ -306,6 +306,6 @@ def tractions(
     step = max(shape) * pitch / (_SQUARES * _FINE)
     fine = Grid(round(shape[0] * pitch / step), round(shape[1] * pitch / step), step)
     stress = np.stack([*field.tangential, field.normal]) / (1e3 * field.pitch**2)
-    planes = (over_picture(plane, field, fine) for plane in stress)
+    planes = (resample_to_image(plane, field, fine) for plane in stress)
     size = _SQUARES, _SQUARES
     return np.stack([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in planes])

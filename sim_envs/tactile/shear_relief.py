@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from touchgoal.control.tactile.sensor_models import SensorModel
-from touchgoal.sim_envs.tactile.forces import ForceField, over_picture
+from touchgoal.sim_envs.tactile.forces import ForceField, resample_to_image
 from touchgoal.sim_envs.tactile.geometry import Grid
 from touchgoal.sim_envs.tactile.markers import layer_compliance
 
@@ -39,7 +39,7 @@ class ShearRelief:
 
         `overlap`: object's overlap with the undeformed gel, on the image's grid.
         """
-        relief = over_picture(self.depth(field), field, self._image)
+        relief = resample_to_image(self.depth(field), field, self._image)
         free = (overlap <= 0).astype(np.float32)
         return relief * cv2.GaussianBlur(free, (0, 0), _RIM / self._image.pitch)
 

@@ -29,8 +29,8 @@ _APART = 10_000  # between the first episodes of two outcomes
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """Number of episodes of one outcome, of some objects in turn, with seeds of their own."""
+class EpisodeBatch:
+    """Episodes to record of one outcome, with the objects in turn and seeds of their own."""
 
     purpose: Literal["training", "goal", "calibration", "test"]
     outcome: Outcome
@@ -89,7 +89,7 @@ class Sizes:
     """Successes of the judged objects that set the success threshold."""
 
 
-def plan(scene: Scene, sizes: Sizes) -> list[Wanted]:
+def plan(scene: Scene, sizes: Sizes) -> list[EpisodeBatch]:
     """Return everything that a scene needs."""
     part = SCENES.index(scene)
     training, goals, test = (
@@ -99,18 +99,18 @@ def plan(scene: Scene, sizes: Sizes) -> list[Wanted]:
     held_out, n_goals = HELD_OUT_OBJECTS, sizes.goals * len(HELD_OUT_OBJECTS)
     counts = dict.fromkeys(KINDS, sizes.episodes) | dict.fromkeys(SUBOPTIMAL, sizes.suboptimal)
     return [
-        Wanted("training", "success", sizes.training, TRAINING_OBJECTS, training),
-        Wanted("goal", "success", n_goals, held_out, goals),
-        Wanted("calibration", "success", sizes.calibration, held_out, goals + _APART),
+        EpisodeBatch("training", "success", sizes.training, TRAINING_OBJECTS, training),
+        EpisodeBatch("goal", "success", n_goals, held_out, goals),
+        EpisodeBatch("calibration", "success", sizes.calibration, held_out, goals + _APART),
         *(
-            Wanted("test", o, counts.get(o, sizes.successes), held_out, test + k * _APART)
+            EpisodeBatch("test", o, counts.get(o, sizes.successes), held_out, test + k * _APART)
             for k, o in enumerate(OUTCOMES)
         ),
     ]
 
 
 def record(
-    folder: Path, scene: Scene, wanted: Sequence[Wanted], env: PickPlaceConfig, workers: int
+    folder: Path, scene: Scene, wanted: Sequence[EpisodeBatch], env: PickPlaceConfig, workers: int
 ) -> list[Recorded]:
     """Record what is missing in `folder`; return all that came out as asked.
 
@@ -148,7 +148,7 @@ def _done(root: Path) -> dict[int, bool]:
 
 
 def _recorded(
-    folder: Path, scene: Scene, wanted: Sequence[Wanted], env: PickPlaceConfig
+    folder: Path, scene: Scene, wanted: Sequence[EpisodeBatch], env: PickPlaceConfig
 ) -> Iterable[Recorded]:
     """Return the episodes that came out as asked, no more than wanted of each."""
     left = {w.first_seed: w.count for w in wanted}

@@ -341,7 +341,7 @@ class FrankaArm(Service):
 
     def _estimate_wrench(self) -> limits.Contact:
         self._pose, jacobian = end_effector(self.cell, self._ee, self.cell.q)
-        known = limits.wrench_behind(self.cell.tau_ext, jacobian)
+        known = limits.wrench_from_torques(self.cell.tau_ext, jacobian)
         self._wrench = known + self.cell.wrench_error
         thresholds, ddq = self._thresholds, self._setpoint.ddq
         return limits.judge_contact(thresholds, self.cell.tau_ext, self._wrench, ddq)

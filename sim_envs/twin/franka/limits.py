@@ -191,7 +191,7 @@ def _above(values, lower, upper):
 
 @njit(cache=True)
 @no_type_check
-def wrench_behind(torque: Joints, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
+def wrench_from_torques(torque: Joints, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
     """Return the wrench (N, Nm) that best explains joint torques (Nm)."""
     return np.linalg.solve(jacobian @ jacobian.T + DAMPING * np.eye(6), jacobian @ torque)
 
