@@ -21,7 +21,7 @@ from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.sensors.keyboard import Keyboard
-from touchgoal.control.teleoperation.device import HandMotion
+from touchgoal.control.teleoperation.device import HandMotion, Verdict
 from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
 from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
@@ -130,7 +130,8 @@ class Pushed:
     """A device that asks for one motion for ever, and then says that it is done."""
 
     def __init__(self, twist: list[float], ticks: float = np.inf) -> None:
-        self.twist, self.ticks, self.verdict = np.array(twist, float), ticks, ""
+        self.twist, self.ticks = np.array(twist, float), ticks
+        self.verdict: Verdict = ""
 
     def press(self, keys: str) -> None: ...
 

@@ -109,6 +109,7 @@ class RealTimeActor(Actor):
 
     def act(self, observation: Observation) -> Float[np.ndarray, "8"]:
         """Return the action for this tick, delayed by `lag`."""
+        self.done = bool(getattr(self._planner, "done", False))  # of users' own policies
         if self._lag is None:
             return self._answer(observation)
         q = observation[ft.COMMAND][: ft.N_JOINTS] + self._lag.remaining

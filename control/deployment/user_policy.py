@@ -84,6 +84,11 @@ class CheckedPolicy:
             )
         return action
 
+    @property
+    def done(self) -> bool:
+        """Whether the policy has ended the episode: by an attribute `done`, if it has one."""
+        return bool(getattr(self._policy, "done", False))
+
     def embed(self, observations: Sequence[Observation]) -> None:
         """Do nothing: no work is done ahead."""
 
