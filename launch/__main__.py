@@ -35,6 +35,7 @@ COMMANDS = {
     "record-presses": "record presses of a ball all over a sensor's gel, and calibrate from them",
     "check-sensor": "try a sensor on your own frames: noise, drift, contact, depth, force, markers",
     "calibrate": "fit a sensor's light and gel to presses of a ball",
+    "calibrate-camera": "measure where a camera is, by a printed board",
     "deploy": "run a policy on an arm or on the twin, with safety and recording",
     "arm": "move an arm home, open or close its hand, recover it after a fault",
     "twin": "serve the simulated cell over the wire protocols of real ones",

@@ -16,7 +16,6 @@ from touchgoal.runtime.option_types import checked_dataclass
 
 if TYPE_CHECKING:
     from touchgoal.control.cell.config import CellConfig
-    from touchgoal.control.deployment.manual import Move
 
 _STOPPED = 4  # exit status
 
@@ -36,12 +35,12 @@ class Config:
 def main(config: Config) -> None:
     """Connect, ask, act, report."""
     from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
-    from touchgoal.control.deployment.manual import arm_and_gripper
+    from touchgoal.control.deployment.manual import without_pictures
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.control.interfaces import DriverError
     from touchgoal.launch.support.confirm import confirm
 
-    cell = arm_and_gripper(read_cell_file(find_cell_file(config.cell)))
+    cell = without_pictures(read_cell_file(find_cell_file(config.cell)))
     if cell.arm == "sim":
         raise UserError(
             "a simulated arm ends with its command: give a real arm's cell file or a twin's"
@@ -70,7 +69,7 @@ def _recover(cell: "CellConfig") -> None:
     print("recovered: the arm takes commands")
 
 
-def _move(move: "Move", cell: "CellConfig") -> None:
+def _move(move: str, cell: "CellConfig") -> None:
     from contextlib import closing
 
     import numpy as np
@@ -78,14 +77,18 @@ def _move(move: "Move", cell: "CellConfig") -> None:
     from touchgoal.control import features as ft
     from touchgoal.control.cell.connection import connect_cell
     from touchgoal.control.deployment.control_loop import PLAN_ENDED
-    from touchgoal.control.deployment.manual import run_move
+    from touchgoal.control.deployment.manual import ManualControl, home_pose
     from touchgoal.control.deployment.terminal import HELP, Terminal
 
     terminal = Terminal()
     with closing(connect_cell(cell, ft.CONTROL_HZ, new_episode=False)) as connection:
         with terminal.watching():
             print(f"MOVING: {HELP}", flush=True)
-            ending = run_move(move, cell, connection, terminal.operator_request, terminal.show_tick)
+            control = ManualControl(cell, connection, terminal.operator_request, terminal.show_tick)
+            if move == "home":
+                ending = control.move_arm(home_pose(cell, connection.robot.arm))
+            else:
+                ending = control.move_hand(opened=move == "open")
         arm, hand = connection.arm.read(), connection.gripper.read()
     holds = ", it holds something" if hand.grasped else ""
     print(

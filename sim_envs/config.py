@@ -106,6 +106,11 @@ NO_RANDOMIZATION = SensorRandomization(
 )
 
 
+CameraPlacement = tuple[float, float, float, float, float, float, float, float]
+"""Place (x, y, z, m), orientation (quaternion wxyz; z looks ahead, y down) and vertical field of view
+(degrees) of a camera."""
+
+
 @checked_dataclass
 class SceneConfig:
     """Options of the scene."""
@@ -120,6 +125,11 @@ class SceneConfig:
     software OpenGL) or visual meshes (full: 242,000 triangles, 30 ms)."""
     timestep: Annotated[Positive, RARE] = 1e-3
     """Time step of the physics, s; it must divide 2 ms."""
+    front_camera: Annotated[CameraPlacement | None, RARE] = None
+    """The front camera as calibrate-camera measured yours, in the base frame: x y z (m), quaternion wxyz (z
+    looks ahead, y down), vertical field of view (degrees)."""
+    wrist_camera: Annotated[CameraPlacement | None, RARE] = None
+    """The same of the wrist camera, in the hand frame."""
 
     def __post_init__(self) -> None:
         """Raise ValueError if set-points would not fall on steps of the physics."""

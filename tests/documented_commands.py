@@ -46,6 +46,7 @@ NOT_RUN = {
     "check-sensor": "needs a sensor and a person: test_own_sensor.py",
     "calibrate": "needs presses of a real sensor: test_calibration.py",
     "train-encoder adapt": "needs videos: test_real_touch.py",
+    "calibrate-camera": "needs a board: test_hand_eye.py",
     "arm": "needs an arm: test_arm_commands.py",
     "push": "needs a hub: test_hub.py",
     "pull": "needs a hub: test_hub.py",

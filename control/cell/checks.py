@@ -15,6 +15,7 @@ from touchgoal.runtime.errors import UserError
 _FORCES = {"franka_hand": (0.0, 70.0), "robotiq": ROBOTIQ_2F85.force}
 _JOINTS = {"fr3": 7, "ur5e": 6, "sim": 7}
 _LEAST_FINGERTIP = 0.01  # m, each side of the box around the fingertips
+_UNIT = 1e-3  # by which a quaternion's length may differ from 1
 _BELOW_FLOOR = 0.005  # m below the fingertips' box that a grasp may lie: the plan raises it
 
 
@@ -22,6 +23,13 @@ def check(cell: CellConfig) -> None:
     """Check how the sections fit together."""
     _check_devices(cell)
     _check_fingertips(cell)
+    for name, camera in cell.cameras.items():
+        if (camera.pose is None) != (camera.fovy is None):
+            raise UserError(
+                f"cameras.{name} has only one of pose and fovy: calibrate-camera writes both"
+            )
+        if camera.pose and abs(np.linalg.norm(camera.pose[3:]) - 1) > _UNIT:
+            raise UserError(f"cameras.{name}.pose must end with a unit quaternion wxyz")
     for name in ("flange", "fingertips"):
         cell_box(cell, name)
     if cell.tool is not None:

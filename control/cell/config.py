@@ -26,6 +26,11 @@ Width = Annotated[float, Field(ge=0, le=0.2)]  # m
 Kelvin = Annotated[int, Field(ge=1000, le=15_000)]
 CameraName = Literal["front", "wrist"]
 SimulatedTask = Literal["pick-place", "bead-maze"]
+UnitComponent = Annotated[float, Field(ge=-1, le=1)]  # of a unit quaternion, wxyz
+CameraPose = tuple[
+    Coordinate, Coordinate, Coordinate, UnitComponent, UnitComponent, UnitComponent, UnitComponent
+]
+FieldOfView = Annotated[float, Field(gt=0, lt=180)]  # degrees
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -104,6 +109,11 @@ class CameraSection:
     """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); default: as it is set."""
     white_balance: Kelvin | None = None
     """White balance to lock, K; default: as it is set."""
+    pose: CameraPose | None = None
+    """Place (x, y, z, m) and orientation (quaternion wxyz; z looks ahead, y down) as calibrate-camera writes
+    it: of front in the base frame, of wrist in the hand frame. A simulated arm has its camera there."""
+    fovy: FieldOfView | None = None
+    """Vertical field of view, degrees, as calibrate-camera writes it; for a simulated arm, too."""
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -1,8 +1,7 @@
-"""Moves without a task: the arm to its start pose, the hand open or closed."""
+"""Moves without a task: the arm to a posture, the hand open or closed."""
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.cell.limits import cell_watchdogs
 from touchgoal.control.deployment.control_loop import (
+    PLAN_ENDED,
     ControlLoop,
     Ending,
     Request,
@@ -18,16 +18,16 @@ from touchgoal.control.deployment.control_loop import (
     TickStatus,
 )
 from touchgoal.control.deployment.scripted import PlannedMove, ScriptedActor, start_move
-from touchgoal.control.interfaces import Joints
+from touchgoal.control.interfaces import Actor, Joints
 from touchgoal.control.motion.arm_models import ArmModel
 from touchgoal.control.safety.action_filter import ActionFilter
 
-Move = Literal["home", "open", "close"]
 _TIMEOUT = 60.0  # s for a move
 _HAND_SECONDS = 1.0  # s for which a hand must stand still to have arrived
+_THERE = 1e-3  # rad from a posture that need not be moved to
 
 
-def arm_and_gripper(cell: CellConfig) -> CellConfig:
+def without_pictures(cell: CellConfig) -> CellConfig:
     """Return the cell without cameras and fingertips: a broken one must not keep the arm in place."""
     return replace(cell, cameras={}, fingertips=None)
 
@@ -37,25 +37,36 @@ def home_pose(cell: CellConfig, arm: ArmModel) -> Joints:
     return arm.home if cell.task.start is None else np.array(cell.task.start)
 
 
-def run_move(
-    move: Move,
-    cell: CellConfig,
-    connection: CellConnection,
-    operator_request: Callable[[], Request],
-    on_tick: Callable[[TickStatus], None],
-) -> Ending:
-    """Run one move inside the cell's limits; `operator_request` and `on_tick` as for `ControlLoop`.
+@dataclass(frozen=True)
+class ManualControl:
+    """One connection inside the cell's limits; the last two fields as for `ControlLoop`.
 
-    The arm goes home slowly and straight in joint space, the hand keeping its width. UserError or
-    DriverError if it cannot begin; nothing has moved then.
+    A move that cannot begin raises UserError or DriverError, and nothing has moved then.
     """
-    safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
-    loop = ControlLoop(connection, safety, True, operator_request, on_tick)
-    if move == "home":
-        goal = home_pose(cell, connection.robot.arm)
-        actor = start_move(goal, loop.width, safety, loop.commanded)
-    else:
-        width = safety.limits.tool.stroke[1] if move == "open" else safety.limits.tool.stroke[0]
-        wait = PlannedMove(None, width, _HAND_SECONDS)
-        actor = ScriptedActor([wait], loop.commanded, ft.CONTROL_HZ)
-    return loop.run(actor, _TIMEOUT, RunLog())
+
+    cell: CellConfig
+    connection: CellConnection
+    operator_request: Callable[[], Request]
+    on_tick: Callable[[TickStatus], None]
+
+    def move_arm(self, goal: Joints) -> Ending:
+        """Move slowly and straight in joint space to a posture (rad), the hand keeping its width."""
+        loop, safety = self._loop()
+        if np.abs(goal - loop.commanded()).max() < _THERE:
+            return Ending(PLAN_ENDED)
+        return self._run(loop, start_move(goal, loop.width, safety, loop.commanded))
+
+    def move_hand(self, opened: bool) -> Ending:
+        """Open the hand, or close it until it meets an object or is closed."""
+        loop, safety = self._loop()
+        wait = PlannedMove(None, safety.limits.tool.stroke[int(opened)], _HAND_SECONDS)
+        return self._run(loop, ScriptedActor([wait], loop.commanded, ft.CONTROL_HZ))
+
+    def _loop(self) -> tuple[ControlLoop, ActionFilter]:
+        watchdogs = cell_watchdogs(self.cell)
+        safety = ActionFilter(self.connection.robot, ft.CONTROL_HZ, watchdogs)
+        loop = ControlLoop(self.connection, safety, True, self.operator_request, self.on_tick)
+        return loop, safety
+
+    def _run(self, loop: ControlLoop, actor: Actor) -> Ending:
+        return loop.run(actor, _TIMEOUT, RunLog())

@@ -3,8 +3,13 @@
 from dataclasses import replace
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import CellConfig
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig
+from touchgoal.control.cell.config import CameraSection, CellConfig
+from touchgoal.sim_envs.config import (
+    BeadMazeConfig,
+    CameraPlacement,
+    PickPlaceConfig,
+    TaskConfig,
+)
 
 
 def env_config_of(config: CellConfig) -> TaskConfig:
@@ -19,4 +24,13 @@ def env_config_of(config: CellConfig) -> TaskConfig:
         tactile=config.fingertips is not None,
         sensor=config.sensor,
         control_hz=ft.CONTROL_HZ,
+        front_camera=_placement(config.cameras.get("front")),
+        wrist_camera=_placement(config.cameras.get("wrist")),
     )
+
+
+def _placement(camera: CameraSection | None) -> CameraPlacement | None:
+    """Return where the cell file says that a camera is; None if it does not."""
+    if camera is None or camera.pose is None or camera.fovy is None:
+        return None
+    return (*camera.pose, camera.fovy)
