@@ -66,7 +66,9 @@ class BoardScene:
         self._renderer.update_scene(self._data, self._camera)
         bgr = np.ascontiguousarray(self._renderer.render()[..., ::-1])
         jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
-        return np.ascontiguousarray(cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1])
+        seen = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+        assert seen is not None
+        return np.ascontiguousarray(seen[..., ::-1])
 
     def true_pose(self) -> np.ndarray:
         """OpenCV's camera frame in the hand's frame (wrist) or the base's (front), by MuJoCo."""

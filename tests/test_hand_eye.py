@@ -76,6 +76,7 @@ def board_on_table(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
     monkeypatch.setattr(hardware, "build", with_board)
     monkeypatch.setattr("touchgoal.sim_envs.cell.in_process.STREAM_SIZE", (480, 640))
+    monkeypatch.setattr("time.sleep", lambda _: None)  # simulated time need not keep pace
     yield
 
 

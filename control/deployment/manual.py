@@ -10,7 +10,6 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.cell.limits import cell_watchdogs
 from touchgoal.control.deployment.control_loop import (
-    PLAN_ENDED,
     ControlLoop,
     Ending,
     Request,
@@ -18,12 +17,12 @@ from touchgoal.control.deployment.control_loop import (
     TickStatus,
 )
 from touchgoal.control.deployment.scripted import PlannedMove, ScriptedActor, start_move
-from touchgoal.control.interfaces import Actor, Joints
+from touchgoal.control.interfaces import Joints
 from touchgoal.control.motion.arm_models import ArmModel
 from touchgoal.control.safety.action_filter import ActionFilter
 
 _TIMEOUT = 60.0  # s for a move
-_HAND_SECONDS = 1.0  # s for which a hand must stand still to have arrived
+_STILL_SECONDS = 1.0  # s for which a hand must stand still to have arrived
 _THERE = 1e-3  # rad from a posture that need not be moved to
 
 
@@ -52,15 +51,16 @@ class ManualControl:
     def move_arm(self, goal: Joints) -> Ending:
         """Move slowly and straight in joint space to a posture (rad), the hand keeping its width."""
         loop, safety = self._loop()
-        if np.abs(goal - loop.commanded()).max() < _THERE:
-            return Ending(PLAN_ENDED)
-        return self._run(loop, start_move(goal, loop.width, safety, loop.commanded))
+        if np.abs(goal - loop.commanded()).max() > _THERE:
+            return loop.run(
+                start_move(goal, loop.width, safety, loop.commanded), _TIMEOUT, RunLog()
+            )
+        return self._wait(loop, loop.width)  # a fault still shows
 
     def move_hand(self, opened: bool) -> Ending:
         """Open the hand, or close it until it meets an object or is closed."""
         loop, safety = self._loop()
-        wait = PlannedMove(None, safety.limits.tool.stroke[int(opened)], _HAND_SECONDS)
-        return self._run(loop, ScriptedActor([wait], loop.commanded, ft.CONTROL_HZ))
+        return self._wait(loop, safety.limits.tool.stroke[int(opened)])
 
     def _loop(self) -> tuple[ControlLoop, ActionFilter]:
         watchdogs = cell_watchdogs(self.cell)
@@ -68,5 +68,7 @@ class ManualControl:
         loop = ControlLoop(self.connection, safety, True, self.operator_request, self.on_tick)
         return loop, safety
 
-    def _run(self, loop: ControlLoop, actor: Actor) -> Ending:
-        return loop.run(actor, _TIMEOUT, RunLog())
+    def _wait(self, loop: ControlLoop, width: float) -> Ending:
+        """Hold the arm until the hand stands still, at `width` (m) or at an object."""
+        wait = PlannedMove(None, width, _STILL_SECONDS)
+        return loop.run(ScriptedActor([wait], loop.commanded, ft.CONTROL_HZ), _TIMEOUT, RunLog())

@@ -46,7 +46,8 @@ class Board:
         corners, ids, _, _ = cv2.aruco.CharucoDetector(self._board).detectBoard(grey)
         if ids is None or len(ids) < _LEAST_CORNERS:
             return None
-        points = np.asarray(self._board.getChessboardCorners(), np.float64)[np.ravel(ids)]
+        corners_on_board = np.asarray(self._board.getChessboardCorners(), np.float64)
+        points = corners_on_board[np.asarray(ids, np.intp).ravel()]
         if np.linalg.matrix_rank(points - points.mean(axis=0)) < 2:  # all on one line
             return None
         return BoardView(points, np.reshape(corners, (-1, 2)).astype(np.float64))
