@@ -314,3 +314,14 @@ def test_bad_input_is_one_line(
         assert message in complaint, complaint
         assert "Traceback" not in complaint
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_align_trains_on_annotations(annotated: tuple, tmp_path: Path) -> None:
+    text = (annotated[0] / "annotations.jsonl").read_text().splitlines()
+    for name, part in (("a", text[:7]), ("b", text[7:])):
+        (tmp_path / f"{name}.jsonl").write_text("\n".join(part))
+    data = ["--data", str(tmp_path / "a.jsonl"), "--validation", str(tmp_path / "b.jsonl")]
+    sizes = "--sensor gelsight_markers --align.backbone vit-tiny --align.epochs 1".split()
+    main(["train-encoder", "align", *data, *sizes, "--out", str(tmp_path / "run")])
+    assert (tmp_path / "run" / "encoder").is_dir()

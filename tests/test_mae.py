@@ -46,14 +46,17 @@ def test_the_paper_preset_is_table_2() -> None:
     assert paper.warmup * paper.epochs == 30 and not paper.bottleneck
 
 
-@pytest.mark.parametrize("bottleneck", [True, False])
-def test_a_killed_training_ends_with_the_same_weights(tmp_path: Path, bottleneck: bool) -> None:
-    data, config = blobs(32, 0), replace(TOY, bottleneck=bottleneck)
+@pytest.mark.parametrize("options", [{}, {"bottleneck": False}, {"stacked": True}])
+def test_a_killed_training_ends_with_the_same_weights(tmp_path: Path, options: dict) -> None:
+    config = replace(TOY, **options)
+    touches = moving_blobs if config.stacked else blobs
+    data = touches(32, 0)
     whole = train_unlabelled(data, data, config, tmp_path / "whole", TrainerOptions(), {})
     with killed_in_epoch(2):
         train_unlabelled(data, data, config, tmp_path / "killed", TrainerOptions(), {})
     go_on = TrainerOptions(resume=True)
     resumed = train_unlabelled(data, data, config, tmp_path / "killed", go_on, {})
+    assert resumed.offsets == ((0, 2) if config.stacked else (0,))
     for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
     with pytest.raises(UserError, match="holds a run already"):
@@ -61,7 +64,7 @@ def test_a_killed_training_ends_with_the_same_weights(tmp_path: Path, bottleneck
     with pytest.raises(UserError, match=r"of another data set.*mae.lr was 0.003, is 0.001"):
         train_unlabelled(data, data, replace(config, lr=1e-3), tmp_path / "killed", go_on, {})
     with pytest.raises(UserError, match=r"of another data set.*\(data was"):
-        train_unlabelled(blobs(32, 1), data, config, tmp_path / "killed", go_on, {})
+        train_unlabelled(touches(32, 1), data, config, tmp_path / "killed", go_on, {})
 
 
 def test_one_visible_patch_is_enough(tmp_path: Path) -> None:
