@@ -28,6 +28,7 @@ from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfi
 if TYPE_CHECKING:
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.policies.network import PolicyConfig
+    from touchgoal.policies.perception.frozen_images import ImageInputConfig
     from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 
 ENVS = dict(reversed(_ENVS.items()))
@@ -71,6 +72,9 @@ class Config(TrainingOptions):
     """Frozen touch encoder: a folder (train-encoder), or the name of a shipped one; default: none."""
     end_to_end: bool = False
     """Train a touch ViT jointly with the policy, instead of a frozen encoder."""
+    cameras: tuple[str, ...] = ()
+    """Cameras that the policy sees by, such as front wrist: keypoints of a frozen image encoder's
+    feature maps, asked anew at every plan; default: none."""
     estimator: Path | None = None
     """Folder of a state estimator (train-estimators). The policy is trained on the simulator's contacts
     and object poses, without images; when it acts, the estimator supplies both."""
@@ -132,6 +136,8 @@ def main(config: Config) -> None:
     check_training(config, config.out)
     if config.end_to_end and config.encoder:
         raise UserError("--end-to-end and --encoder exclude each other: leave out one")
+    if config.cameras and config.estimator:
+        raise UserError("--cameras and --estimator exclude each other: leave out one")
     touch = load_touch(config.encoder) if config.encoder else None
     parts = {TOUCH: find_encoder(config.encoder, published=False)} if config.encoder else {}
     if config.estimator:
@@ -201,6 +207,7 @@ def _policy_config(
         touch_noise=config.touch_noise,
         position_noise=config.position_noise,
         end_to_end=EndToEndConfig() if config.end_to_end else None,
+        images=_image_input(config, episodes),
         proprioception=(*columns, ft.WRENCH, *ESTIMATED) if config.estimator else columns,
         representation=config.representation,
         observation_horizon=config.observation_horizon,
@@ -208,6 +215,27 @@ def _policy_config(
         control_hz=episodes.fps,
         head=head,
     )
+
+
+def _image_input(config: Config, episodes: "EpisodeSet") -> "ImageInputConfig | None":
+    from touchgoal.control import features as ft
+    from touchgoal.policies.perception.frozen_images import ImageInputConfig
+    from touchgoal.runtime.errors import UserError
+
+    if not config.cameras:
+        return None
+    keys = tuple(ft.IMAGE_PREFIX + name.removeprefix(ft.IMAGE_PREFIX) for name in config.cameras)
+    there = [key for key in episodes.features if key.startswith(ft.IMAGE_PREFIX)]
+    if missing := set(keys) - set(there):
+        raise UserError(
+            f"{episodes.root} has no {sorted(missing)[0]}; its cameras: {', '.join(there) or 'none'}"
+        )
+    sizes = {tuple(episodes.features[key]["shape"][:2]) for key in keys}
+    if len(sizes) > 1:
+        raise UserError(
+            f"the cameras' images have several sizes: {sorted(sizes)}; choose one camera"
+        )
+    return ImageInputConfig(keys, *sizes)
 
 
 def _env(config: Config, task: TaskName) -> TaskConfig:

@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float16, Float32, UInt8
 from torch import Tensor
 
 from touchgoal.control import features as ft
@@ -16,6 +16,7 @@ from touchgoal.control.features import Observation
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.policies.network import ObservationBatch, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import difference_images
+from touchgoal.policies.perception.frozen_images import ImageEmbedder
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.perception.state_estimation import StateEstimator
@@ -83,6 +84,7 @@ class LearnedPolicy:
         if config.estimated and estimator is None:
             raise UserError(f"the policy acts on {config.estimated[0]}: give it a state estimator")
         self._network, self.touch, self._estimator = network, touch, estimator
+        self._images = ImageEmbedder(config.images) if config.images else None
         self.plan_ticks, self.directory = plan_ticks, directory
         self._check_delay(plan_ticks)
         self.history_ticks = config.observation_horizon + (touch.reach if touch else 0)
@@ -96,6 +98,7 @@ class LearnedPolicy:
         self._generator = torch.Generator().manual_seed(seed)
         self._first: Observation = {}
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
+        self._maps: tuple[Observation, Tensor] | None = None  # the latest embedded camera images
         self._recent: list[Observation] = []
         self._todo: list[np.ndarray] = []  # actions of the present plan
         self._next: list[np.ndarray] = []  # actions of the plan that comes next
@@ -128,7 +131,8 @@ class LearnedPolicy:
             self.embed(history)
             _, touch, state = zip(*self._embedded, strict=True)
             touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (touch, state))
-            batch = ObservationBatch(touch, state, self._difference_images(history[-1]))
+            pictures, maps = self._difference_images(history[-1]), self._feature_maps(history[-1])
+            batch = ObservationBatch(touch, state, pictures, maps)
             return self._network.plan(batch, self._generator)[0].numpy()
 
     def embed(self, history: Sequence[Observation]) -> None:
@@ -137,6 +141,7 @@ class LearnedPolicy:
         ends = range(len(history) - self.config.observation_horizon + 1, len(history) + 1)
         with one_thread():
             self._embedded = [(history[end - 1], *self._embed_tick(history[:end])) for end in ends]
+            self._feature_maps(history[-1])
 
     def _embed_tick(self, history: Sequence[Observation]) -> tuple[np.ndarray, np.ndarray]:
         """Return the touch embedding (e,) and the proprioception (s,) of the latest tick."""
@@ -156,6 +161,15 @@ class LearnedPolicy:
         if self.touch is None:
             return np.empty(0, np.float32)
         return self.touch.embed_tick(history, self._first)
+
+    def _feature_maps(self, observation: Observation) -> Float16[Tensor, "1 k c y x"] | None:
+        """Return the maps of the camera images; those of the latest observation are kept."""
+        if self._images is None:
+            return None
+        if self._maps is None or self._maps[0] is not observation:
+            maps = torch.from_numpy(self._images.embed_tick(observation))[None]
+            self._maps = observation, maps
+        return self._maps[1]
 
     def _difference_images(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
         end_to_end = self.config.end_to_end
@@ -183,10 +197,13 @@ class LearnedPolicy:
         self._check_task(task, name or task_name(task))
         estimator = self._learned_estimator
         reads_touch = config.touch_dim > 0 or config.end_to_end is not None or estimator is not None
-        if estimator is None:
+        if config.images:
+            keys, size = config.images.cameras, config.images.size
+        elif estimator:
+            keys, size = estimator.cameras, estimator.camera_size
+        else:
             return replace(task, tactile=reads_touch, cameras=())
-        cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in estimator.cameras)
-        size = estimator.camera_size
+        cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in keys)
         return replace(task, tactile=reads_touch, cameras=cameras, camera_size=size)
 
     @property

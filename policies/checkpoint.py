@@ -15,6 +15,7 @@ from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.network import PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
+from touchgoal.policies.perception.frozen_images import ImageInputConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
 from touchgoal.runtime.errors import UserError
@@ -146,6 +147,9 @@ def _config(fields: dict[str, Any]) -> PolicyConfig:
         fields["head"] = RegressionConfig(**head)
     if end_to_end := fields["end_to_end"]:
         fields["end_to_end"] = EndToEndConfig(**end_to_end | {"size": tuple(end_to_end["size"])})
+    if images := fields.get("images"):
+        pairs = {name: tuple(images[name]) for name in ("cameras", "size")}
+        fields["images"] = ImageInputConfig(**images | pairs)
     for key in ("proprioception", "gripper_widths"):
         fields[key] = tuple(fields[key])
     return PolicyConfig(**fields)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float16, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
@@ -24,6 +24,7 @@ from touchgoal.policies.heads.diffusion import (
     RegressionConfig,
 )
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
+from touchgoal.policies.perception.frozen_images import ImageInputConfig, ImageReadout
 from touchgoal.policies.perception.proprioception import input_widths, is_position, network_input
 from touchgoal.runtime.errors import UserError
 
@@ -52,6 +53,7 @@ class PolicyConfig:
     # them, because the hand would stop at one in between. Empty: any width
     gripper_widths: tuple[float, ...] = ()
     end_to_end: EndToEndConfig | None = None  # touch encoder that is trained jointly; None without
+    images: ImageInputConfig | None = None  # cameras, by a frozen image encoder; None without
     # columns of `features.FEATURES`, the state first. Columns that only a simulator knows come from
     # a state estimator on an arm. The wrench is tared, see `proprioception.tare`
     proprioception: tuple[str, ...] = (ft.STATE, ft.TCP_POSE)
@@ -113,6 +115,8 @@ class ObservationBatch:
     state: Float[Tensor, "b o s"]  # `PolicyConfig.proprioception`, side by side, SI units
     # difference images of the latest tick, for the end-to-end encoder; None without
     pictures: UInt8[Tensor, "b k h w 3"] | None = None
+    # feature maps of the latest tick's camera images, see `ImageEmbedder`; None without
+    maps: Float16[Tensor, "b k c y x"] | None = None
 
     @property
     def joints(self) -> Float[Tensor, "b 7"]:
@@ -149,6 +153,9 @@ class PolicyNetwork(nn.Module):
         if config.end_to_end:
             self.end_to_end_encoder = EndToEndEncoder(config.end_to_end)
             condition_dim += len(ft.TACTILE) * config.end_to_end.width
+        self.image_readout = ImageReadout(config.images) if config.images else None
+        if self.image_readout:
+            condition_dim += self.image_readout.width
         self.condition_dim = condition_dim
         if isinstance(config.head, DiffusionConfig):
             self.head = Diffusion(config.head, ticks, ACTION_DIM, condition_dim)
@@ -163,6 +170,7 @@ class PolicyNetwork(nn.Module):
         actions: Float[Tensor, "m h 8"],
         wrench: Float[Tensor, "n 12"] | None = None,
         action_is_pad: Bool[Tensor, "m h"] | None = None,
+        maps: Float16[Tensor, "n k c y x"] | None = None,
     ) -> None:
         """Fit the normalizers to training data: n ticks, and the chunks of m windows.
 
@@ -173,6 +181,9 @@ class PolicyNetwork(nn.Module):
             self.touch_normalizer.fit_mean_std(touch)
         if wrench is not None:
             self.wrench_normalizer.fit_mean_std(wrench)
+        if self.image_readout:
+            assert maps is not None, "needs the cameras' feature maps"
+            self.image_readout.fit(maps)
         columns, kind = self.config.proprioception, self.config.representation
         self.state_normalizer.fit_mean_std(network_input(state, columns, kind))
         valid = None if action_is_pad is None else ~action_is_pad[..., None]
@@ -241,8 +252,11 @@ class PolicyNetwork(nn.Module):
             state = state + self.config.position_noise * shift * is_position(columns, kind).to(
                 state
             )
-        encoded = torch.cat([touch, state], -1).flatten(1)
-        if self.end_to_end_encoder is None:
-            return encoded
-        assert batch.pictures is not None, "needs tactile images"
-        return torch.cat([encoded, self.end_to_end_encoder(batch.pictures)], 1)
+        parts = [torch.cat([touch, state], -1).flatten(1)]
+        if self.end_to_end_encoder:
+            assert batch.pictures is not None, "needs tactile images"
+            parts.append(self.end_to_end_encoder(batch.pictures))
+        if self.image_readout:
+            assert batch.maps is not None, "needs the cameras' feature maps"
+            parts.append(self.image_readout(batch.maps.float()))
+        return torch.cat(parts, 1)

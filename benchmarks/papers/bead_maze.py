@@ -32,11 +32,8 @@ from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import RegressionConfig
 from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.frozen_touch import shipped_touch
-from touchgoal.policies.training.sequence_dataset import (
-    SequenceDataset,
-    cached_embeddings,
-    load_recordings,
-)
+from touchgoal.policies.training.embedding_cache import cached_embeddings
+from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, CountOrNone, checked_dataclass
 from touchgoal.sim_envs.bead_maze import BeadMaze

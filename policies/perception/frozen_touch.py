@@ -24,7 +24,7 @@ class TouchEmbedder:
 
     Attributes:
         name: identifies the embeddings, see `PolicyConfig.touch`.
-        dim: width of a row.
+        dim: width of a row; `shape` is (dim,).
         sensor: name of the fingertip sensor; None for any.
         reach: number of earlier ticks that an embedding depends on; 0 with single frames.
     """
@@ -32,6 +32,7 @@ class TouchEmbedder:
     def __init__(self, encoder: pretrained.AnyTouchEncoder, name: str) -> None:
         self.encoder, self.name = encoder, name
         self.dim = len(ft.TACTILE) * encoder.config.embedding_dim
+        self.shape = (self.dim,)
         self.sensor = encoder.config.sensor
         self.reach = max(encoder.offsets)
         self._recent = {

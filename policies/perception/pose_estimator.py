@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from touchgoal.control import features as ft
 from touchgoal.policies.actions import Normalizer
 from touchgoal.policies.config import PoseEstimatorConfig
+from touchgoal.policies.perception.keypoints import keypoints
 
 _START = ft.FEATURES[ft.TRUTH_START].shape[0]
 _TCP = ft.FEATURES[ft.TCP_POSE].shape[0]
@@ -73,9 +74,4 @@ class _SpatialSoftmax(nn.Module):
 
     def forward(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b p"]:
         maps = F.relu(self.surroundings(self.patches(pictures)))
-        share = self.attention(maps).flatten(2).softmax(2)
-        h, w = maps.shape[2:]
-        y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
-        place = torch.stack([x, y]).flatten(1).expand(len(maps), -1, -1).to(maps)
-        there = torch.cat([place, self.features(maps).flatten(2)], 1)
-        return (share @ there.mT).flatten(1)
+        return keypoints(self.attention(maps), self.features(maps))

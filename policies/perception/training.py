@@ -21,7 +21,7 @@ from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.placements import Placements
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
 from touchgoal.policies.perception.state_estimation import StateEstimatorNetwork
-from touchgoal.policies.training.sequence_dataset import embed_episodes
+from touchgoal.policies.training.embedding_cache import embed_episodes
 
 _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose counts linearly
 

@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,12 +13,12 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
+from touchgoal.policies.perception.frozen_images import ImageEmbedder
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
-from touchgoal.runtime.atomic_write import atomic_write
+from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
-from touchgoal.runtime.worker_pool import one_core_workers
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +31,7 @@ class Recordings:
     lengths: tuple[int, ...]  # ticks of each episode
     pictures: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
     wrench: Float32[Tensor, "n 12"] | None = None  # on both pads (N, Nm, pad frames), if trained on
+    maps: Float16[Tensor, "n k c y x"] | None = None  # of the cameras, see `ImageEmbedder`
 
 
 def load_recordings(
@@ -51,6 +50,8 @@ def load_recordings(
     """
     _check(episodes, chosen, config, embedder)
     embedded = embed_episodes(episodes, chosen, embedder, workers) if embedder else None
+    images = ImageEmbedder(config.images) if config.images else None
+    maps = embed_episodes(episodes, chosen, images, workers) if images else []
     keys = [*config.proprioception, ft.ACTION, *[ft.TRUTH_PAD_WRENCH] * config.reads_wrench]
     touch, state, actions, pictures, wrench = [], [], [], [], []
     for n, i in enumerate(track(chosen, "reading", "episode")):
@@ -72,7 +73,13 @@ def load_recordings(
         lengths=tuple(len(rows) for rows in actions),
         pictures=torch.from_numpy(np.concatenate(pictures)) if config.end_to_end else None,
         wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
+        maps=_joined(maps, skip) if images else None,
     )
+
+
+def _joined(maps: list[np.ndarray], skip: Sequence[int] | None) -> Float16[Tensor, "n k c y x"]:
+    starts = skip or [0] * len(maps)
+    return torch.from_numpy(np.concatenate([m[s:] for m, s in zip(maps, starts, strict=True)]))
 
 
 def _difference_images(
@@ -117,56 +124,10 @@ def _check(
             f"the policy needs touch {config.touch!r} of width {config.touch_dim}, this is "
             f"{made[0]!r} of width {made[1]}: make its config for this embedder"
         )
+    if config.images and (missing := set(config.images.cameras) - set(episodes.features)):
+        raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy reads")
     if embedder or config.end_to_end:
         check_fingertips(episodes, chosen)
-
-
-def embed_episodes(
-    episodes: EpisodeSet, chosen: Sequence[int], embedder: TouchEmbedder, workers: int = 1
-) -> list[Float16[np.ndarray, "t e"]]:
-    """Return the embeddings of episodes, from the cache or made and cached."""
-    _fill_cache(episodes, chosen, embedder, workers)
-    return [cached_embeddings(episodes, i, embedder) for i in chosen]
-
-
-def cached_embeddings(
-    episodes: EpisodeSet, i: int, embedder: TouchEmbedder
-) -> Float16[np.ndarray, "t e"]:
-    """Return the cached embeddings of an episode; UserError if they are damaged."""
-    path = _cache_path(episodes, embedder, i)
-    rows = np.load(path)
-    if rows.shape != (episodes.lengths[i], embedder.dim):
-        raise UserError(f"{path} is damaged: delete {path.parent}, which is made again")
-    return rows
-
-
-def _cache_path(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> Path:
-    """Return the file inside the set, named by episode and encoder weights."""
-    folder = episodes.root / ".cache" / "embeddings" / embedder.name.replace("/", "_")
-    return folder / f"{episodes.episode_checksum(i)[:32]}.npy"
-
-
-def _fill_cache(
-    episodes: EpisodeSet, chosen: Sequence[int], embedder: TouchEmbedder, workers: int
-) -> None:
-    missing = [i for i in chosen if not _cache_path(episodes, embedder, i).exists()]
-    if not missing:
-        return
-    _cache_path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
-    make = partial(_embed, episodes, embedder)
-    progress = partial(track, what="embedding touch", unit="episode", total=len(missing))
-    if workers == 1:
-        list(progress(map(make, missing)))
-        return
-    with one_core_workers(workers) as pool:
-        list(progress(pool.map(make, missing)))
-
-
-def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:
-    torch.set_num_threads(1)
-    rows, path = embedder.embed(episodes, i).astype(np.float16), _cache_path(episodes, embedder, i)
-    with atomic_write(path) as unfinished, unfinished.open("wb") as file:
-        np.save(file, rows)
 
 
 class SequenceDataset:
@@ -207,8 +168,9 @@ class SequenceDataset:
         """Return observations and actions of some windows."""
         observed, recorded = self._observed[rows], self.recorded
         pictures = None if recorded.pictures is None else recorded.pictures[rows]
+        maps = None if recorded.maps is None else recorded.maps[rows]
         batch = ObservationBatch(
-            recorded.touch[observed].float(), recorded.state[observed], pictures
+            recorded.touch[observed].float(), recorded.state[observed], pictures, maps
         )
         return batch, recorded.actions[self._planned[rows]]
 

@@ -53,7 +53,7 @@ def train(
         network = PolicyNetwork(policy)
     network.fit_normalizers(
         recorded.touch.float(), recorded.state, windows.joints, windows.actions,
-        recorded.wrench, windows.action_is_pad,
+        recorded.wrench, windows.action_is_pad, recorded.maps,
     )  # fmt: skip
     average = AveragedModel(network, multi_avg_fn=_update_average).eval().requires_grad_(False)
     averaged = cast(PolicyNetwork, average.module)
@@ -117,12 +117,13 @@ class _PolicyLoss(nn.Module):
         touch: Float[Tensor, "b o e"],
         state: Float[Tensor, "b o s"],
         pictures: Tensor | None,
+        maps: Tensor | None,
         wrench: Float[Tensor, "b o 12"] | None,
         actions: Float[Tensor, "b h 8"],
         action_is_pad: Bool[Tensor, "b h"],
         noise: BatchNoise,
     ) -> dict[str, Tensor]:
-        batch = ObservationBatch(touch, state, pictures)
+        batch = ObservationBatch(touch, state, pictures, maps)
         return {"loss": self.policy.loss(batch, actions, noise, wrench, action_is_pad)}
 
 
@@ -132,6 +133,7 @@ def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, 
         "touch": observed.touch,
         "state": observed.state,
         "pictures": observed.pictures,
+        "maps": observed.maps,
         "wrench": windows.wrench(rows),
         "actions": actions,
         "action_is_pad": windows.action_is_pad[rows],
@@ -148,7 +150,7 @@ def _validate(
     device = policy.action_normalizer.scale.device
     batch = send_to_device(_make_batch(windows, rows), device)
     generator = torch.Generator().manual_seed(seed)
-    observed = ObservationBatch(batch["touch"], batch["state"], batch["pictures"])
+    observed = ObservationBatch(*(batch[name] for name in ("touch", "state", "pictures", "maps")))
     planned = policy.plan(observed, generator)
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
@@ -161,7 +163,7 @@ def _checksum(windows: SequenceDataset) -> str:
     recorded = windows.recorded
     return checksum(
         recorded.touch, recorded.state, recorded.actions, recorded.pictures, recorded.wrench,
-        map(str, recorded.lengths),
+        recorded.maps, map(str, recorded.lengths),
     )  # fmt: skip
 
 

@@ -1,0 +1,105 @@
+"""Frozen image encoder for a policy's cameras: feature maps, of which it learns keypoints."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16
+from torch import Tensor, nn
+
+from touchgoal.control import features as ft
+from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
+from touchgoal.encoders.towers.towers import imagenet_pixels
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.policies.perception.keypoints import keypoints
+from touchgoal.runtime.errors import UserError
+
+_CHANNELS = 112  # of `EfficientNetLite0.map`
+_BATCH = 4  # images; the activations of more leave the cache
+
+
+@dataclass(frozen=True)
+class ImageInputConfig:
+    """Cameras that a policy reads at every plan, and what it learns of their feature maps."""
+
+    cameras: tuple[str, ...]  # columns such as observation.images.front
+    size: tuple[int, int]  # rows and columns of their images, px
+    keypoints: int = 16  # of each image
+    features: int = 16  # of each keypoint
+
+
+class ImageEmbedder:
+    """Feature maps of camera images at stride 16 by the offline image tower (EfficientNet-Lite0).
+
+    Attributes:
+        name: identifies the maps.
+        shape: of one tick's maps: cameras, channels, rows, columns.
+    """
+
+    def __init__(self, config: ImageInputConfig) -> None:
+        """Get ready; UserError if the image tower's wheel is missing."""
+        self.config, self._network = config, _network()
+        cameras = "-".join(key.removeprefix(ft.IMAGE_PREFIX) for key in config.cameras)
+        self.name = f"efficientnet-lite0-stride16/{cameras}"
+        blank = np.zeros((1, *config.size, 3), np.uint8)
+        self.shape = (len(config.cameras), *self._maps(blank).shape[1:])
+
+    def embed(self, episodes: EpisodeSet, i: int) -> Float16[np.ndarray, "t k c y x"]:
+        """Embed all ticks of an episode; UserError if its images have another size."""
+        frames = episodes.read(i, self.config.cameras).frames
+        return np.stack([self._maps(frames[key]) for key in self.config.cameras], 1)
+
+    def embed_tick(self, observation: Mapping[str, np.ndarray]) -> Float16[np.ndarray, "k c y x"]:
+        """Embed one tick, with the same result as `embed`."""
+        return np.concatenate([self._maps(observation[key][None]) for key in self.config.cameras])
+
+    def _maps(self, images: np.ndarray) -> Float16[np.ndarray, "n c y x"]:
+        if images.shape[1:3] != self.config.size:
+            given, wanted = (f"{h} x {w}" for h, w in (images.shape[1:3], self.config.size))
+            raise UserError(
+                f"camera images are {given}, the policy reads {wanted}: make the environment with "
+                "load_policy(...).env_config(), or set camera_size"
+            )
+        with torch.no_grad():
+            batches = [
+                self._network.map(imagenet_pixels(images[i : i + _BATCH])).half().numpy()
+                for i in range(0, len(images), _BATCH)
+            ]
+        return np.concatenate(batches)
+
+
+@cache
+def _network() -> EfficientNetLite0:
+    return load_efficientnet_lite0().requires_grad_(False)
+
+
+class ImageReadout(nn.Module):
+    """Network from the feature maps of all cameras to keypoints; each camera has its own."""
+
+    def __init__(self, config: ImageInputConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.mean = nn.Buffer(torch.zeros(len(config.cameras), _CHANNELS, 1, 1))
+        self.std = nn.Buffer(torch.ones(len(config.cameras), _CHANNELS, 1, 1))
+        width = config.keypoints + config.features
+        self.readouts = nn.ModuleList(nn.Conv2d(_CHANNELS, width, 1) for _ in config.cameras)
+        self.width = len(config.cameras) * config.keypoints * (2 + config.features)
+
+    def fit(self, maps: Float16[Tensor, "n k c y x"]) -> None:
+        """Fit mean and standard deviation of each channel to training data."""
+        sample = maps[:: max(1, len(maps) // 512)].float()
+        self.mean.copy_(sample.mean((0, 3, 4))[..., None, None])
+        self.std.copy_(sample.std((0, 3, 4)).clamp(min=1e-3)[..., None, None])
+
+    def forward(self, maps: Float[Tensor, "b k c y x"]) -> Float[Tensor, "b p"]:
+        """Return the keypoints of all cameras, with their features."""
+        scaled = (maps - self.mean) / self.std
+        parts = []
+        for camera, readout in enumerate(self.readouts):
+            attention, features = readout(scaled[:, camera]).split(
+                [self.config.keypoints, self.config.features], 1
+            )
+            parts.append(keypoints(attention, features))
+        return torch.cat(parts, 1)

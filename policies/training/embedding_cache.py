@@ -1,0 +1,79 @@
+"""Embeddings of recorded episodes by a frozen encoder, cached inside the episode set."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float16
+
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.atomic_write import atomic_write
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
+from touchgoal.runtime.worker_pool import one_core_workers
+
+
+@runtime_checkable
+class Embedder(Protocol):
+    """Frozen encoder of an episode's ticks."""
+
+    name: str  # identifies the embeddings
+    shape: tuple[int, ...]  # of one tick's
+
+    def embed(self, episodes: EpisodeSet, i: int) -> np.ndarray:
+        """Embed all ticks of an episode."""
+        ...
+
+
+def embed_episodes(
+    episodes: EpisodeSet, chosen: Sequence[int], embedder: Embedder, workers: int = 1
+) -> list[Float16[np.ndarray, "t ..."]]:
+    """Return the embeddings of episodes, from the cache or made and cached.
+
+    A kill loses those in progress.
+    """
+    _fill_cache(episodes, chosen, embedder, workers)
+    return [cached_embeddings(episodes, i, embedder) for i in chosen]
+
+
+def cached_embeddings(
+    episodes: EpisodeSet, i: int, embedder: Embedder
+) -> Float16[np.ndarray, "t ..."]:
+    """Return the cached embeddings of an episode; UserError if they are damaged."""
+    path = _cache_path(episodes, embedder, i)
+    rows = np.load(path)
+    if rows.shape != (episodes.lengths[i], *embedder.shape):
+        raise UserError(f"{path} is damaged: delete {path.parent}, which is made again")
+    return rows
+
+
+def _cache_path(episodes: EpisodeSet, embedder: Embedder, i: int) -> Path:
+    """Return the file inside the set, named by episode and encoder weights."""
+    folder = episodes.root / ".cache" / "embeddings" / embedder.name.replace("/", "_")
+    return folder / f"{episodes.episode_checksum(i)[:32]}.npy"
+
+
+def _fill_cache(
+    episodes: EpisodeSet, chosen: Sequence[int], embedder: Embedder, workers: int
+) -> None:
+    missing = [i for i in chosen if not _cache_path(episodes, embedder, i).exists()]
+    if not missing:
+        return
+    _cache_path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
+    make = partial(_embed, episodes, embedder)
+    progress = partial(track, what="embedding", unit="episode", total=len(missing))
+    if workers == 1:
+        list(progress(map(make, missing)))
+        return
+    with one_core_workers(workers) as pool:
+        list(progress(pool.map(make, missing)))
+
+
+def _embed(episodes: EpisodeSet, embedder: Embedder, i: int) -> None:
+    torch.set_num_threads(1)
+    rows, path = embedder.embed(episodes, i).astype(np.float16), _cache_path(episodes, embedder, i)
+    with atomic_write(path) as unfinished, unfinished.open("wb") as file:
+        np.save(file, rows)
