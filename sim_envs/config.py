@@ -55,7 +55,7 @@ Camera = Literal["front", "wrist"]
 Indenter = Literal["sphere", "sharp", "flat"]
 """A probe of the indenter rig."""
 ObjectName = Annotated[str, AfterValidator(lambda name: find_object(name).name)]
-"""A name of the catalogue of objects."""
+"""A name of the catalogue of objects, or the mesh file of one's own."""
 WireName = Annotated[str, AfterValidator(lambda name: find_wire(name).name)]
 """A name such as helix-1."""
 Force = Annotated[float, Field(gt=0, le=40.0, allow_inf_nan=False)]
@@ -267,7 +267,8 @@ class PickPlaceConfig(EnvConfig):
     """Options of pick-place; reset's `options` override the random draws."""
 
     objects: tuple[ObjectName, ...] = ()
-    """Objects to draw from (`touchgoal list objects`); default: all."""
+    """Objects to draw from (`touchgoal list objects`), or mesh files of your own (.stl, .obj);
+    default: all."""
     distractors: Annotated[int, Field(ge=0, le=4)] = 0
     """Number of other objects on the table."""
     mass: Annotated[tuple[Mass, Mass], ORDERED] = (0.02, 0.2)

@@ -1,6 +1,7 @@
 """The task of the paper's robot experiment: pick an object up and place it at a goal."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -38,7 +39,8 @@ class PickPlace(FrankaTactileEnv):
 
     def instruction(self) -> str:
         """Return the episode's task in words."""
-        return f"pick up the {self.asked.replace('_', ' ')} and place it on the disc"
+        name = Path(self.asked).stem.replace("_", " ")  # of an object of one's own: its mesh file
+        return f"pick up the {name} and place it on the disc"
 
     def episode_info(self) -> dict[str, Any]:
         """Return what distinguishes this episode: the object, how it is gripped, what was asked."""
@@ -52,7 +54,7 @@ class PickPlace(FrankaTactileEnv):
     def grasp_yaw(self, name: str = "object") -> float:
         """Return the hand yaw that closes across an object, in [-pi/2, pi/2]."""
         body = next(b for b in self.bodies if b.name == name)
-        if body.kind.shape in ("sphere", "cylinder", "mesh"):
+        if body.kind.shape in ("sphere", "cylinder", "mesh") and body.kind.hull is None:
             return 0.0
         w, x, y, z = self.object_pose(name)[3:]
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

@@ -4,6 +4,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -55,6 +56,8 @@ class ObjectKind:
     shape: Shape
     material: Material
     descriptions: tuple[str, ...]
+    # vertices of a mesh with one shape, m, see `read_hull`; None: drawn for each body
+    hull: Float[np.ndarray, "n 3"] | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class Body:
 
     kind: ObjectKind  # entry of the catalogue
     # half extents as MuJoCo takes them (box: xyz; cylinder and capsule: radius, half length;
-    # sphere: radius; mesh: scale of the unit hull), m
+    # sphere: radius; mesh: those of the catalogue's unit hull, or of an own object's bounds), m
     size: tuple[float, ...]
     mass: float  # kg
     name: str = "object"
@@ -111,10 +114,25 @@ _SIZES: dict[Shape, tuple[tuple[float, float], ...]] = {
 
 
 def find(name: str) -> ObjectKind:
-    """Return the catalogue's entry; UserError lists the names."""
+    """Return the catalogue's entry, or an object of one's own by its mesh file (.stl, .obj).
+
+    UserError: an unknown name, which lists the names, or see `read_hull`.
+    """
+    if Path(name).suffix.lower() in (".stl", ".obj"):
+        return _own_kind(name)
     if name not in CATALOGUE:
         raise UserError(f"unknown object {name!r}; choose from: {', '.join(CATALOGUE)}")
     return CATALOGUE[name]
+
+
+@cache
+def _own_kind(path: str) -> ObjectKind:
+    """Return a mesh as an object with the surface of a printed part."""
+    from touchgoal.sim_envs.scene.own_object import read_hull  # loads MuJoCo: not for --help
+
+    words = Path(path).stem.replace("_", " ").replace("-", " ")
+    material = Material(Texture.RIBBED, 15e-6, 0.6e-3, HARD, 0.6, (0.6, 0.6, 0.65, 1.0))
+    return ObjectKind(path, "mesh", material, (words,), read_hull(Path(path)))
 
 
 def of_same_shape(name: str, among: Sequence[str]) -> str:
@@ -130,6 +148,9 @@ def sample_body(
     kind: ObjectKind, rng: np.random.Generator, mass: float, name: str = "object"
 ) -> Body:
     """Draw an object of this kind with a random size; meshes also get a random convex hull."""
+    if kind.hull is not None:
+        half = kind.hull.max(0)
+        return Body(kind, (float(half[0]), float(half[1]), float(half[2])), mass, name, kind.hull)
     size = tuple(float(rng.uniform(*bounds)) for bounds in _SIZES[kind.shape])
     hull = size[0] * _unit_hull(rng) if kind.shape == "mesh" else None
     return Body(kind, size, mass, name, hull)
