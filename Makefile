@@ -99,17 +99,17 @@ weights-surfaces: $(READY)
 	cp runs/words/encoder/* encoders/weights/gelsight_mini_surfaces/
 
 # How a shipped policy is made anew, by one command each that says what it did (recipe.json beside the
-# weights). With new pads add `--learn-touch` for the maze, whose touch encoder is then learned first;
-# pick-and-place needs `touchgoal train-estimators --pose` alone. (What ships of it had other rounds,
-# see docs/training.md.) `--wrench` makes the maze's baseline, policies/weights/bead_maze_wrench.
+# weights). The maze's learns its touch encoder first; with new pads pick-and-place needs `touchgoal
+# train-estimators --pose` alone. (What ships of it had other rounds, see docs/training.md.)
 pick-place-policy: $(READY)
 	$(BIN)/touchgoal make-policy --out runs/pick_place
 	rm -rf policies/weights/pick_place && cp -r runs/pick_place/policy/policy policies/weights/pick_place
 
 maze-policy: $(READY)
-	$(BIN)/touchgoal make-policy --task bead-maze --out runs/maze
+	$(BIN)/touchgoal make-policy --task bead-maze --learn-touch --out runs/maze
 	rm -rf policies/weights/bead_maze && cp -r runs/maze/policy/policy policies/weights/bead_maze
-	rm -r policies/weights/bead_maze/touch
+	mv policies/weights/bead_maze/touch/* encoders/weights/gelsight_mini_markers_mae/
+	rmdir policies/weights/bead_maze/touch
 
 $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV): about 1 GB from PyPI, 2 to 3 minutes"

@@ -25,7 +25,6 @@ BUILT_IN = {
     "follower": "bead-maze: classical control from the force on the hand",
     "shipped": "the policy that ships for the task",
     **{name: f"the policy that ships for {name}" for name in SHIPPED_POLICIES},
-    "bead-maze-wrench": "the maze's baseline, which reads wrenches from touch",
 }
 """Names of policies, and what they are."""
 
