@@ -272,7 +272,7 @@ def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         writer.append(Episode({k: np.stack([t[k] for t in ticks]) for k in ticks[0]}, "feel"))
     episodes = EpisodeSet(tmp_path / "set/episodes")
     first = load_recordings(episodes, [0, 1], config, embedder)
-    monkeypatch.setattr(embedder, "embed", None)  # a second embedding would fail
+    monkeypatch.setattr(embedder, "embed", lambda *_: pytest.fail("a second embedding"))
     again = load_recordings(episodes, [1], config, embedder)
     assert first.lengths == (4, 6)
     assert torch.equal(first.touch[4:], again.touch)
