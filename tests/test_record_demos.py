@@ -5,6 +5,8 @@ import os
 import select
 import socket
 import struct
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -13,7 +15,9 @@ import pytest
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.deployment.control_loop import RunLog
 from touchgoal.control.deployment.scripted import PickPlacePoses
+from touchgoal.control.deployment.session import distance_gone
 from touchgoal.control.deployment.terminal import Terminal
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.motion.kinematics import Kinematics
@@ -234,6 +238,39 @@ def test_own_demonstrations_train_a_policy_that_deploys(
 
 def run(*arguments: object) -> None:
     main([str(a) for a in arguments])
+
+
+def test_a_person_leads_the_arm_by_keys(tmp_path: Path) -> None:
+    """Led some way without a record, one success, one discarded, and no more: one is on disk."""
+    cell = tmp_path / "cell.toml"
+    cell.write_text(CELL.replace("seconds = 2.0", "seconds = 60"))
+    end, terminal = os.openpty()
+    command = [sys.executable, "-m", "touchgoal.launch", "record-demos", str(cell), "--yes"]
+    program = subprocess.Popen(
+        [*command, "--out", str(tmp_path / "run")], stdin=terminal, stdout=terminal
+    )
+    typed = iter([("Enter begins", "f"), (" s  ", "\n"), ("RECORDING", "w"), (" s  ", "www\n"),
+                  ("Enter begins", "\n"), ("RECORDING", "w"), (" s  ", "q"),
+                  ("Enter begins", "q")])  # fmt: skip
+    seen, (awaited, keys) = "", next(typed)
+    while program.poll() is None:
+        if select.select([end], [], [], 1)[0]:
+            seen += os.read(end, 4096).decode()
+        if awaited and awaited in seen:
+            os.write(end, keys.encode())
+            seen, (awaited, keys) = "", next(typed, ("", ""))
+    assert program.returncode == 0 and not awaited, seen
+    for one in (end, terminal):
+        os.close(one)
+    found = EpisodeSet(tmp_path / "run" / "episodes")
+    assert len(found) == 1 and found.meta(0)["success"] and found.meta(0)["policy"] == "keyboard"
+    assert found.read(0).frames[ft.ACTION][:, :-1].any()
+
+
+def test_progress_is_the_share_of_the_distance_that_is_gone() -> None:
+    rows = [{ft.COST: np.array([cost], np.float32)} for cost in (0.4, 0.6, 0.1)]
+    assert distance_gone(RunLog(rows)) == pytest.approx(0.75)
+    assert distance_gone(RunLog(rows[:2])) == 0 and distance_gone(RunLog()) is None
 
 
 @pytest.mark.parametrize(

@@ -175,10 +175,7 @@ class Session:
                 return float(self._truth()["progress"])
         except UserError:  # the twin has ended
             return None
-        costs = [float(row[ft.COST][0]) for row in log.rows if ft.COST in row]
-        if not self.cell.task.own or not costs or costs[0] <= 0:
-            return None
-        return float(np.clip(1 - costs[-1] / costs[0], 0.0, 1.0))
+        return distance_gone(log) if self.cell.task.own else None
 
     def _held_width(self) -> float | None:
         try:
@@ -201,6 +198,14 @@ class Session:
         if success is not None:
             meta["success"] = success
         return self.record(log.frames(), cell.task.instruction or cell.task.name, meta)
+
+
+def distance_gone(log: RunLog) -> float | None:
+    """Return the share of the first tick's cost that is gone at the end; None without a cost."""
+    costs = [float(row[ft.COST][0]) for row in log.rows if ft.COST in row]
+    if not costs or costs[0] <= 0:
+        return None
+    return float(np.clip(1 - costs[-1] / costs[0], 0.0, 1.0))
 
 
 def metrics(result: Result) -> dict[str, Any]:
