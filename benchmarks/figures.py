@@ -122,6 +122,12 @@ def named(metrics: Metrics, **inputs: str) -> str:
     return "; ".join("{} {:.0f} % [{:.0f}, {:.0f}]".format(k, *v) for k, v in figures.items())
 
 
+def named_by_sentences(metrics: Metrics) -> str:
+    """Share of touches whose object is found by its sentences, by number of candidates; first encoder."""
+    row = {key: value for key, value in metrics["rows"][0].items() if key != "encoder"}
+    return "; ".join(f"of {k} {m:.0f} % [{low:.0f}, {high:.0f}]" for k, (m, low, high) in row.items())
+
+
 def faults(metrics: Metrics) -> str:
     """Faults that lose no episode, and the longest time to rest."""
     rows = metrics["rows"]

@@ -47,7 +47,7 @@ policy() { # name, options
 for name in untrained mae dino ijepa vjepa; do
     policy "maze-half-$name" --share 0.5 --encoder "runs/maze-$name/encoder" --touch-input embedding
 done
-policy maze-half-aligned --share 0.5 --encoder gelsight_mini_markers_offline --touch-input embedding
+policy maze-half-aligned --share 0.5 --encoder gelsight_mini_markers --touch-input embedding
 policy maze-half-shipped --share 0.5 --encoder gelsight_mini_markers_mae --touch-input embedding
 policy maze-half-wrench --share 0.5 --encoder gelsight_mini_markers_mae
 policy maze-half-end-to-end --share 0.5 --end-to-end

@@ -19,7 +19,7 @@ AnyTouchEncoder = TouchEncoder | TouchBackbone | PooledEncoder
 """Aligned with images and texts; trained without labels; a whitened ImageNet network."""
 
 _WEIGHTS = Path(__file__).parent / "weights"
-DEFAULT_ENCODER = _WEIGHTS / "gelsight_mini_offline"
+DEFAULT_ENCODER = _WEIGHTS / "gelsight_mini"
 ENCODER_FORMAT = WeightsFormat(
     "encoder", "touch encoder", "train one with: touchgoal train-encoder"
 )
@@ -48,19 +48,13 @@ def save(
     ENCODER_FORMAT.save(directory, weights, config, provenance)
 
 
-def shipped_encoder_for(sensor: str | None, words: bool = True) -> Path:
+def shipped_encoder_for(sensor: str | None) -> Path:
     """Return the shipped encoder for a sensor, on the offline towers; the default one for None.
-
-    Without `words` it is the one that tells surfaces apart, where there is one: it recognises real
-    objects better than those aligned with texts in simulation (`benchmark real-touch`).
 
     Raises:
         UserError: None ships.
     """
-    surfaces = _WEIGHTS / f"{sensor}_surfaces"
-    if not words and surfaces.is_dir():
-        return surfaces
-    directory = _WEIGHTS / f"{sensor}_offline" if sensor else DEFAULT_ENCODER
+    directory = _WEIGHTS / sensor if sensor else DEFAULT_ENCODER
     if not directory.is_dir():
         raise UserError(f"no touch encoder ships for {sensor}: {ENCODER_FORMAT.remedy}")
     return directory
@@ -75,15 +69,15 @@ def find_encoder(name_or_path: str | Path, published: bool = True) -> Path:
     """Return the folder of an encoder of ours, or the file of a published one.
 
     Args:
-        name_or_path: A folder; a name of `encoder_names`; a sensor, for its shipped encoder on the
-            offline towers; published Sparsh weights, as file, folder or Hugging Face id.
+        name_or_path: A folder; a name of `encoder_names`, such as a sensor's; published Sparsh
+            weights, as file, folder or Hugging Face id.
         published: Accept published weights.
 
     Raises:
         UserError: No such encoder, or a published one where it is not accepted.
     """
     name = str(name_or_path)
-    for directory in (Path(name), _WEIGHTS / name, _WEIGHTS / f"{name}_offline"):
+    for directory in (Path(name), _WEIGHTS / name):
         if (directory / "encoder.json").is_file():
             return directory
     if (weights := find_published(name)) is not None:

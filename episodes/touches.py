@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from touchgoal.control.arrays import Picture
-from touchgoal.control.features import TACTILE, TRUTH_CONTACT, WRIST
+from touchgoal.control.features import TACTILE, TACTILE_LEFT, TRUTH_CONTACT, WRIST
 from touchgoal.control.sensors.exchanged import fingertips_exchanged
 from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.contact import ContactDetector, threshold_for
@@ -61,29 +61,22 @@ def collect_touches(
         no_contact_frames_per_episode: Number of frames without contact on their side.
         seed: Random seed; an episode's draw does not depend on the other episodes.
     """
-    sides = _check(episodes)
+    if WRIST not in episodes.features:
+        raise UserError(f"{episodes.root} has no wrist images: record {WRIST} too")
+    sides = check_touches(episodes)
     most = len(episodes) * (contact_frames_per_episode + no_contact_frames_per_episode)
     frames = np.empty((most, *episodes.features[TACTILE[sides[0]]]["shape"]), np.uint8)
     sampled, backgrounds, views, filled = [], [], [], 0
     for i in track(range(len(episodes)), "drawing touches", "episode"):
-        background = [_background(episodes, i, side) for side in sides]
-        contact = _contact(episodes, i, sides)
-        rng = np.random.default_rng([seed, i])
-        picked = np.concatenate(
-            [
-                _sample_frames(contact, contact_frames_per_episode, rng),
-                _sample_frames(~contact, no_contact_frames_per_episode, rng),
-            ]
+        drawn = draw_frames(
+            episodes, i, contact_frames_per_episode, no_contact_frames_per_episode, seed
         )
-        for column, side in enumerate(sides):
-            rows = np.flatnonzero(picked[:, 1] == column)
-            key = TACTILE[side]
-            frames[filled + rows] = episodes.read(i, [key], picked[rows, 0].tolist()).frames[key]
-        filled += len(picked)
-        in_contact = contact[picked[:, 0], picked[:, 1]]
-        sampled.append(np.column_stack([np.full(len(picked), i), picked[:, 1], in_contact]))
-        backgrounds += background
-        views.append(_view(episodes, i, contact))
+        n = len(drawn.frames)
+        frames[filled : filled + n] = drawn.frames
+        filled += n
+        sampled.append(np.column_stack([np.full(n, i), drawn.column, drawn.in_contact]))
+        backgrounds += drawn.background
+        views.append(_view(episodes, i, drawn.contact))
     episode_index, column, in_contact = np.concatenate(sampled).T
     if not in_contact.any():
         raise UserError(f"{episodes.root} has no contact: give episodes with contact")
@@ -95,15 +88,52 @@ def collect_touches(
         view=np.stack(views),
         view_index=episode_index,
         object=tuple(names[i] if f else "" for i, f in zip(episode_index, in_contact, strict=True)),
-        descriptions=_descriptions(episodes),
+        descriptions=descriptions(episodes),
     )
 
 
-def _check(episodes: EpisodeSet) -> list[int]:
-    """Return the sides of a set; UserError if it lacks touch, wrist images or descriptions."""
-    sides = [side for side, key in enumerate(TACTILE) if key in episodes.features]
-    if not sides or WRIST not in episodes.features:
-        raise UserError(f"{episodes.root} has no touch or no wrist images: record {WRIST} too")
+@dataclass(frozen=True, eq=False)
+class DrawnFrames:
+    """n frames drawn from one episode of t ticks with s fingertips."""
+
+    frames: UInt8[np.ndarray, "n h w 3"]  # raw sensor RGB, one side each
+    column: Int[np.ndarray, " n"]  # fingertip of each frame, counted among those recorded
+    in_contact: Bool[np.ndarray, " n"]  # of each frame
+    background: list[Picture]  # of each fingertip, untouched
+    contact: Bool[np.ndarray, "t s"]  # of every tick
+
+
+def draw_frames(
+    episodes: EpisodeSet, i: int, contact_frames: int, no_contact_frames: int, seed: int
+) -> DrawnFrames:
+    """Draw frames of one episode, see `collect_touches`."""
+    sides = _sides(episodes)
+    contact = _contact(episodes, i, sides)
+    rng = np.random.default_rng([seed, i])
+    picked = np.concatenate(
+        [
+            _sample_frames(contact, contact_frames, rng),
+            _sample_frames(~contact, no_contact_frames, rng),
+        ]
+    )
+    frames = np.empty((len(picked), *episodes.features[TACTILE[sides[0]]]["shape"]), np.uint8)
+    for column, side in enumerate(sides):
+        rows, key = np.flatnonzero(picked[:, 1] == column), TACTILE[side]
+        frames[rows] = episodes.read(i, [key], picked[rows, 0].tolist()).frames[key]
+    background = [_background(episodes, i, side) for side in sides]
+    in_contact = contact[picked[:, 0], picked[:, 1]]
+    return DrawnFrames(frames, picked[:, 1], in_contact, background, contact)
+
+
+def _sides(episodes: EpisodeSet) -> list[int]:
+    return [side for side, key in enumerate(TACTILE) if key in episodes.features]
+
+
+def check_touches(episodes: EpisodeSet) -> list[int]:
+    """Return the sides of a set; UserError if it lacks touch or descriptions."""
+    sides = _sides(episodes)
+    if not sides:
+        raise UserError(f"{episodes.root} has no touch: record {TACTILE_LEFT} too")
     if missing := {"object", "descriptions"} - set(episodes.meta(0)):
         raise UserError(f"{episodes.root} lacks meta {', '.join(sorted(missing))}: record them")
     check_fingertips(episodes, range(len(episodes)))
@@ -199,7 +229,7 @@ def _view(
     return episodes.read(i, [WRIST], [frame]).frames[WRIST][0]
 
 
-def _descriptions(episodes: EpisodeSet) -> dict[str, list[str]]:
+def descriptions(episodes: EpisodeSet) -> dict[str, list[str]]:
     """Return the distinct sentences on each object, in the order in which they appear."""
     sentences_of: dict[str, dict[str, None]] = {}
     for i in range(len(episodes)):

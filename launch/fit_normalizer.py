@@ -76,8 +76,7 @@ def main(config: Config) -> None:
     with_touch = config.towers is None or config.encoder is not None
     sources = open_successes(config.sources, config.camera, with_touch, config.assume_success)
     inputs = sources[0].inputs
-    words = "text" in config.modalities
-    embedder, _ = load_embedder(inputs, config.encoder, config.towers, config.device, words)
+    embedder, _ = load_embedder(inputs, config.encoder, config.towers, config.device)
     trajectories = [t for source in sources for t in source.trajectories]
     if config.success_from:
         check_demonstrations(config.success_from)

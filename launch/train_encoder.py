@@ -115,14 +115,17 @@ class Surfaces:
 class Words:
     """Add words and pictures to an encoder of `surfaces`: maps to its embeddings, which do not change."""
 
-    data: Path
-    """Touches of objects, recorded by `collect-touches --body wand`."""
-    encoder: str = "gelsight_mini_surfaces"
+    data: Annotated[tuple[Path, ...], Field(min_length=1)]
+    """Sets of touched objects on which there are sentences: of `collect-touches --body wand`, whose
+    views teach pictures (at least one), and of `collect-demos`, in which objects are grasped."""
+    encoder: str = "gelsight_mini"
     """Encoder to add to: a name, or its folder."""
     towers: str = "offline"
     """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local folder."""
     surfaces: Annotated[Count, RARE] = 2000
     """Random surfaces that teach roughness and bumpiness beside the objects."""
+    contact_frames: Annotated[Count, RARE] = 24
+    """Frames with contact taken from each episode of a grasp, both fingertips together."""
     backgrounds: str = "screen"
     """Background of the objects in the views: screen (the green screen, as recorded), generated, or a
     folder of pictures."""
@@ -141,7 +144,7 @@ class Adapt:
     data: Path
     """Folder with videos/ and labels.csv in PhysiCLeAR's layout; its splits train and unlabelled are
     used. Where labels.csv ranks hardness, roughness and bumpiness, the encoder also learns sentences."""
-    encoder: str = "gelsight_mini_surfaces"
+    encoder: str = "gelsight_mini"
     """Encoder to adapt: a name, or its folder."""
     towers: str = "offline"
     """Frozen towers for the sentences: offline, or a CLIP as Hugging Face id or local folder."""
@@ -225,8 +228,11 @@ def _fit_to_surfaces(config: Surfaces) -> None:
 
 def _add_words(config: Words) -> None:
     from touchgoal.control.tactile.sensor_models import find_sensor
-    from touchgoal.encoders.alignment.wand_set import WandSet
-    from touchgoal.encoders.alignment.words import add_words
+    from touchgoal.encoders.alignment.described_touches import embed_grasps, pair
+    from touchgoal.encoders.alignment.green_screen import background_changer
+    from touchgoal.encoders.alignment.heads import fit_heads
+    from touchgoal.encoders.alignment.wand_set import WandSet, is_wand_set
+    from touchgoal.encoders.alignment.words import embed_surfaces, embed_wand, with_heads
     from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
     from touchgoal.encoders.pretrained import ENCODER_FORMAT, find_encoder, load_encoder, save
     from touchgoal.encoders.towers.towers import load_towers
@@ -234,31 +240,38 @@ def _add_words(config: Words) -> None:
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run
 
-    data, encoder = WandSet.open(config.data), load_encoder(config.encoder)
+    encoder = load_encoder(config.encoder)
     if not isinstance(encoder, PooledEncoder):
         raise UserError(
             f"{config.encoder} was not trained by `train-encoder surfaces`: add words to one that was"
         )
+    of_wand = [root for root in config.data if is_wand_set(root)]
+    if not of_wand:
+        raise UserError("no set has views: record one with collect-touches --body wand")
     sensor, towers = find_sensor(encoder.config.sensor), load_towers(config.towers)
+    change = background_changer(config.backgrounds, config.seed)
     out = open_run(config.out, "train-encoder", config)
-    worded = add_words(
-        encoder,
-        data,
-        towers,
-        config.heads,
-        sensor,
-        config.surfaces,
-        config.backgrounds,
-        config.seed,
-    )
-    source = {"data": str(config.data), "touches": len(data), "objects": len(data.names)}
-    source |= {
+    sets = [
+        embed_wand(encoder, WandSet.open(root), towers, change)
+        if root in of_wand
+        else embed_grasps(encoder, root, config.contact_frames, config.seed)
+        for root in config.data
+    ]
+    surfaces = embed_surfaces(encoder, sensor, config.surfaces, config.seed)
+    heads = fit_heads(pair([*sets, surfaces], towers), config.heads, config.seed)
+    source = {
+        "data": [
+            {"path": str(root), "touches": len(own.object), "objects": len(own.sentences)}
+            for root, own in zip(config.data, sets, strict=True)
+        ],
         "surfaces": config.surfaces,
+        "contact_frames": config.contact_frames,
         "backgrounds": config.backgrounds,
         "heads": asdict(config.heads),
         "seed": config.seed,
     }
     before = ENCODER_FORMAT.provenance(find_encoder(config.encoder, published=False))
+    worded = with_heads(encoder, towers, heads)
     save(worded, out / "encoder", {"words_added_to": before, **source, **provenance()})
     print(f"encoder: {out / 'encoder'}")
 

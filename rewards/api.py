@@ -94,7 +94,7 @@ def reward_curve(
     goals = list(goal) if isinstance(goal, list | tuple) else [goal]
     specs = [spec for one in goals for spec in _as_specs(one, episode)]
     if encoder is None and inputs.sides:
-        encoder = shipped_encoder_for("gelsight_mini", any(isinstance(s, Sentence) for s in specs))
+        encoder = shipped_encoder_for("gelsight_mini")
     model = load_reward_model(inputs, specs, encoder, towers, normalizer, device)
     return model.curves(model.embedder.embed_episode(episode, fps, inputs.name))
 

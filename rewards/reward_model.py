@@ -14,7 +14,7 @@ from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNormalizer
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
-from touchgoal.rewards.goals import Goal, GoalSpec, Inputs, Sentence, assign_goals, check_goal
+from touchgoal.rewards.goals import Goal, GoalSpec, Inputs, assign_goals, check_goal
 from touchgoal.rewards.value.value import REMEDY as VALUE_REMEDY
 from touchgoal.rewards.value.value import VALUE_FORMAT, Value
 from touchgoal.runtime.errors import UserError
@@ -68,8 +68,7 @@ def load_reward_model(
     if isinstance(normalizer, str | Path) and str(normalizer) not in ("encoder", "none"):
         name, value_folder = normalizer, Path(normalizer).parent
         normalizer = DistanceNormalizer.load(Path(normalizer))
-    words = any(isinstance(spec, Sentence) for spec in goals)
-    embedder, folder = load_embedder(inputs, encoder, towers, device, words)
+    embedder, folder = load_embedder(inputs, encoder, towers, device)
     check_words(goals, embedder.encoder)
     if isinstance(normalizer, DistanceNormalizer):
         if reason := _mismatch(normalizer, inputs, goal, embedder):
@@ -135,16 +134,15 @@ def load_embedder(
     encoder: str | Path | AnyTouchEncoder | None = None,
     towers: str | Towers | None = None,
     device: str = "cpu",
-    words: bool = False,
 ) -> tuple[EpisodeEmbedder, Path | None]:
     """Load the encoders for trajectories; return them, and the folder that may have a normalizer.
 
-    Default: the touch encoder that ships for the sensor (`words`: that takes sentences), and the
-    towers that it was aligned with, else "offline". UserError: no encoder ships for the sensor, it
-    is for another one, or it was aligned with other towers.
+    Default: the touch encoder that ships for the sensor, and the towers that it was aligned with,
+    else "offline". UserError: no encoder ships for the sensor, it is for another one, or it was
+    aligned with other towers.
     """
     _check_device(device)
-    touch, folder = _load_touch(inputs, encoder, words)
+    touch, folder = _load_touch(inputs, encoder)
     if touch is not None:
         touch.to(device)
     if isinstance(towers, str) or towers is None:
@@ -161,7 +159,7 @@ def _check_device(device: str) -> None:
 
 
 def _load_touch(
-    inputs: Inputs, encoder: str | Path | AnyTouchEncoder | None, words: bool
+    inputs: Inputs, encoder: str | Path | AnyTouchEncoder | None
 ) -> tuple[AnyTouchEncoder | None, Path | None]:
     if not inputs.sides:
         if encoder is not None:
@@ -169,15 +167,15 @@ def _load_touch(
         return None, pretrained.DEFAULT_ENCODER  # whose normalizer knows images, too
     if isinstance(encoder, AnyTouchEncoder):
         return encoder, None
-    path = _shipped_for(inputs, words) if encoder is None else pretrained.find_encoder(encoder)
+    path = _shipped_for(inputs) if encoder is None else pretrained.find_encoder(encoder)
     return pretrained.load_encoder(path, inputs.sensor), path if path.is_dir() else None
 
 
-def _shipped_for(inputs: Inputs, words: bool) -> Path:
+def _shipped_for(inputs: Inputs) -> Path:
     images_alone = "or measure the images alone: --towers offline"
     if inputs.sensor is None:
         raise UserError(f"{inputs.name} does not name its sensor: give --encoder, {images_alone}")
     try:
-        return pretrained.shipped_encoder_for(inputs.sensor, words)
+        return pretrained.shipped_encoder_for(inputs.sensor)
     except UserError as error:
         raise UserError(f"{error}; {images_alone}") from None

@@ -33,7 +33,7 @@ TOY = {
     "train-encoder dino": "--frames 8 --dino.vit tiny --dino.epochs 1 --dino.batch-size 8",
     "train-encoder ijepa": "--frames 8 --ijepa.vit tiny --ijepa.epochs 1 --ijepa.batch-size 8",
     "train-encoder vjepa": "--frames 8 --vjepa.vit tiny --vjepa.epochs 1 --vjepa.batch-size 8",
-    "train-encoder words": "--surfaces 4 --heads.epochs 1 --encoder gelsight_mini_surfaces",
+    "train-encoder words": "--surfaces 4 --heads.epochs 1 --encoder gelsight_mini",
     "train-encoder surfaces": "--surfaces 16 --presses-per-surface 2",
     "train-policy": "--head tiny --train.epochs 1 --trials 0 --workers 1",
     "record-demos": "--episodes 1 --yes",

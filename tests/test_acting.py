@@ -150,7 +150,7 @@ def test_a_policy_feels_with_the_encoder_of_its_training(tmp_path: Path) -> None
     """The one in its folder, else the one that ships under that name, and no other."""
     name = checkpoint.load(SHIPPED_POLICIES["bead-maze"]).config.touch
     assert load_touch_of(tmp_path / "none", name).name == name
-    shutil.copytree(find_encoder("gelsight_mini_offline"), tmp_path / "touch")
+    shutil.copytree(find_encoder("gelsight_mini"), tmp_path / "touch")
     assert load_touch_of(tmp_path / "touch", name).name != name
     with pytest.raises(UserError, match="none like it ships"):
         load_touch_of(tmp_path / "none", "gelsight_mini/v1/0123456789ab")

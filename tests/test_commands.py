@@ -332,7 +332,7 @@ def test_corrupt_episode_is_skipped_and_named(
     shutil.copytree(episodes, broken)
     data = sorted(broken.rglob("data/**/*.parquet"))
     data[0].write_bytes(data[0].read_bytes()[:1000])
-    run("reward-curves", broken, "--out", out, "--encoder", "gelsight_mini_surfaces")
+    run("reward-curves", broken, "--out", out, "--encoder", "gelsight_mini")
     assert f"1 of 2 skipped, see {out / 'skipped.csv'}" in capsys.readouterr().out
     [row] = (out / "skipped.csv").read_text().splitlines()[1:]
     assert row.startswith("episode_000,") and data[0].name in row and "repair" in row

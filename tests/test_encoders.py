@@ -312,9 +312,12 @@ def test_embed_takes_one_picture_or_many() -> None:
 def test_encoders_are_found_by_name_or_path(tmp_path: Path) -> None:
     shipped = pretrained.load_encoder("gelsight_mini")
     assert shipped.config.sensor == "gelsight_mini"
-    assert pretrained.find_encoder("gelsight_mini_offline") == pretrained.DEFAULT_ENCODER
+    assert pretrained.find_encoder("gelsight_mini") == pretrained.DEFAULT_ENCODER
     assert pretrained.find_encoder(pretrained.DEFAULT_ENCODER) == pretrained.DEFAULT_ENCODER
-    with pytest.raises(UserError, match="there is no touch encoder 'gelsigt': .*gelsight_mini_off"):
+    with pytest.raises(
+        UserError,
+        match="there is no touch encoder 'gelsigt': .*gelsight_mini, gelsight_mini_markers",
+    ):
         pretrained.load_encoder("gelsigt")
     with pytest.raises(UserError, match="no touch encoder in"):
         pretrained.load_encoder(tmp_path)

@@ -10,7 +10,9 @@ import torch.nn.functional as F
 from in_process import in_process_workers
 
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet
+from touchgoal.benchmarks.papers.mmwand.grasped_objects import _hits
 from touchgoal.benchmarks.papers.mmwand.retrieval import PUBLISHED, judge
+from touchgoal.control import features as ft
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.heads import PairedEmbeddings, fit_heads
 from touchgoal.encoders.alignment.splits import SPLITS, Fold, split_touches
@@ -19,6 +21,8 @@ from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.whitening.surface_words import surface_ranks
 from touchgoal.episodes import wand_recording
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.episodes.wand_recording import record_touches
 from touchgoal.launch.__main__ import main
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
@@ -102,9 +106,9 @@ def test_heads_bring_words_and_pictures_to_touch() -> None:
     )
     heads = fit_heads(paired, HeadsConfig(epochs=60, batch_size=100), 0)
     again = fit_heads(paired, HeadsConfig(epochs=60, batch_size=100), 0)
-    assert torch.equal(heads.text.weight, again.text.weight)
-    texts = heads.texts(paired.texts).detach()
-    images = heads.images(paired.image[:, 0]).detach()
+    assert torch.equal(heads.text.linear.weight, again.text.linear.weight)
+    texts = heads.text(paired.texts).detach()
+    images = heads.image(paired.image[:, 0]).detach()
     owner = paired.describes.long().argmax(0)
     assert (owner[(touch @ texts.T).argmax(1)] == paired.label).float().mean() > 0.9
     assert (paired.label[(touch @ images.T).argmax(1)] == paired.label).float().mean() > 0.9
@@ -123,19 +127,48 @@ def test_a_surface_is_called_what_it_is() -> None:
     assert ranks(200e-6 * coarse) == (0, 2)
 
 
-def test_words_are_added_to_an_encoder_that_stays_as_it_is(wand: Path, tmp_path: Path) -> None:
-    command = (
-        f"train-encoder words --data {wand} --out {tmp_path / 'run'} --surfaces 6 --heads.epochs 2"
-    )
-    command += " --backgrounds generated"
+def grasps(root: Path) -> Path:
+    """Two objects that press a stripe along and across the gel; the second finger is not recorded."""
+    rng = np.random.default_rng(0)
+    for name, stripe in (("pipe", np.s_[100:140, :]), ("rail", np.s_[:, 140:180])):
+        gel = rng.integers(90, 110, (240, 320, 3), dtype=np.uint8)
+        frames = np.repeat(gel[None], 12, axis=0)
+        frames[6:, *stripe] = 200
+        contact = np.repeat(np.arange(12)[:, None] >= 6, 2, axis=1)
+        meta = {
+            "object": name,
+            "descriptions": [f"the feel of a {name}"],
+            "sensor": "gelsight_mini",
+        }
+        observed = {ft.TACTILE_LEFT: frames, ft.TRUTH_CONTACT: contact}
+        EpisodeWriter(root).append(Episode(observed, "grasp", meta))
+    return root
+
+
+def test_words_are_added_to_an_encoder_that_stays_as_it_is(
+    wand: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grasped = grasps(tmp_path / "grasps")
+    command = f"train-encoder words --data {wand} {grasped} --out {tmp_path / 'run'} --surfaces 6"
+    command += " --heads.epochs 100 --backgrounds generated"
     assert main(command.split()) in (0, None)
-    worded, plain = load_encoder(tmp_path / "run/encoder"), load_encoder("gelsight_mini_surfaces")
+    worded, plain = load_encoder(tmp_path / "run/encoder"), load_encoder("gelsight_mini")
     picture = np.random.default_rng(0).integers(0, 255, (2, 240, 320, 3), dtype=np.uint8)
     np.testing.assert_allclose(worded.embed(picture), plain.embed(picture), atol=2e-3)
     assert worded.towers == "offline" and isinstance(worded, PooledEncoder)
     words = worded.embed_text_goal(["a hard object", "a soft object"], load_towers("offline"))
     images = worded.project_image(torch.rand(3, worded.config.image_dim)).numpy()
     np.testing.assert_allclose(np.linalg.norm([*words, *images], axis=1), 1, atol=1e-4)
+    command = f"benchmark zero-shot --data {grasped} --encoders {tmp_path / 'run/encoder'}"
+    assert main([*command.split(), "--out", str(tmp_path / "judged")]) in (0, None)
+    assert "12 touches of 2 objects" in capsys.readouterr().out
+    [row] = json.loads((tmp_path / "judged/metrics.json").read_text())["rows"]
+    assert row["2"][0] == 100
+
+
+def test_fewer_candidates_are_hit_more_often() -> None:
+    hits = _hits(np.array([0, 1, 4]), objects=5, candidates=2)
+    np.testing.assert_allclose(hits, [1, 3 / 4, 0])
 
 
 @pytest.mark.parametrize("name", ["retrieval", "classification"])

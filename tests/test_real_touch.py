@@ -89,7 +89,7 @@ def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
         within = np.square(seen - means[(names == "object1").astype(int)]).sum(1).mean()
         return float(within / np.square(means[0] - means[1]).sum())
 
-    assert apart(adapted) < 0.7 * apart(load_encoder("gelsight_mini_surfaces"))
+    assert apart(adapted) < 0.7 * apart(load_encoder("gelsight_mini"))
 
 
 def test_sentences_are_judged_on_objects_never_seen() -> None:
@@ -107,10 +107,10 @@ def test_sentences_are_judged_on_objects_never_seen() -> None:
 
 def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="was not trained by"):
-        main(["train-encoder", "adapt", "--data", str(clips), "--encoder", "gelsight_mini",
+        main(["train-encoder", "adapt", "--data", str(clips), "--encoder", "gelsight_mini_markers",
               "--out", str(tmp_path / "a")])  # fmt: skip
     one = [video for video in read_labelled_videos(clips) if video.path.stem.endswith("_0")]
-    surfaces = load_encoder("gelsight_mini_surfaces")
+    surfaces = load_encoder("gelsight_mini")
     assert isinstance(surfaces, PooledEncoder)
     with pytest.raises(UserError, match="no object has two videos"):
         adapt(surfaces, one, 0.1, OfflineTowers())

@@ -296,7 +296,7 @@ def test_the_shipped_one_loads_and_takes_the_light_out() -> None:
     rest = render_untouched(unit, rng)
     frame = press(Surface("ball", 5e-3, 1.0, SMOOTH, 1.0), LEVEL, unit, rng)
     lit = np.rint(frame * 1.1).clip(0, 255).astype(np.uint8)
-    steady, brighter, other = load_encoder("gelsight_mini_surfaces").embed(
+    steady, brighter, other = load_encoder("gelsight_mini").embed(
         np.stack([frame, lit, press(random_surface(rng), LEVEL, unit, rng)]), rest
     )
     assert np.linalg.norm(brighter - steady) < 0.7 * np.linalg.norm(other - steady)
@@ -309,8 +309,6 @@ def test_light_on_an_untouched_gel_is_no_touch() -> None:
     rest, again = render_untouched(unit, rng), render_untouched(unit, rng)
     light = press(Surface("ball", 5e-3, 1.0, SMOOTH, 1.0), replace(LEVEL, depth=0.05e-3), unit, rng)
     frames = [again, *(np.rint(again * gain).astype(np.uint8) for gain in (0.9, 1.1)), light]
-    same, darker, brighter, touched = load_encoder("gelsight_mini_surfaces").embed(
-        np.stack(frames), rest
-    )
+    same, darker, brighter, touched = load_encoder("gelsight_mini").embed(np.stack(frames), rest)
     lightest = np.linalg.norm(touched - same)
     assert max(np.linalg.norm(darker - same), np.linalg.norm(brighter - same)) < 0.2 * lightest

@@ -10,11 +10,12 @@ import torch
 from jaxtyping import Float32, Int, UInt8
 
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder, TouchBackbone
 from touchgoal.encoders.backbones.vit import ViT
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.published import find_published
-from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
+from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_pixels
 from touchgoal.runtime.errors import UserError, install_extra
 
@@ -67,6 +68,8 @@ def untrained(name: str, seed: int) -> BaseTouchEncoder:
     encoder = load_encoder(name)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
+        if isinstance(encoder, PooledEncoder):
+            return PooledEncoder(encoder.config, EfficientNetLite0().eval()).eval()
         fresh = type(encoder)(encoder.config)  # pyright: ignore[reportArgumentType]
     return fresh.eval()
 

@@ -24,7 +24,7 @@ class Config(BenchmarkOptions):
 
     data: Path = field(kw_only=True)
     """Folder with grasps.csv, TRIAL.avi and TRIAL.csv, laid out as EstimateModulus'."""
-    encoders: tuple[str, ...] = ("gelsight_mini_surfaces", "pixels")
+    encoders: tuple[str, ...] = ("gelsight_mini", "pixels")
     """Touch encoders, named as for benchmark real-touch."""
     corners: Corners | None = None
     """Corners of the gel in the image, x and y in px (top left, top right, bottom left, bottom

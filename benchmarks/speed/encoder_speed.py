@@ -42,7 +42,7 @@ SparshShape = Literal["mae-tiny", "mae-small", "mae-base", "dino-base", "ijepa-b
 class Config(BenchmarkOptions):
     """Options of benchmark encoder-speed."""
 
-    encoders: tuple[str, ...] = ("gelsight_mini", "gelsight_mini_surfaces")
+    encoders: tuple[str, ...] = ("gelsight_mini", "gelsight_mini_markers")
     """Touch encoders: a name, a folder, or a published Sparsh file or id."""
     shapes: tuple[SparshShape, ...] = get_args(SparshShape)
     """Sparsh's networks with random weights: base as published, tiny and small narrower."""

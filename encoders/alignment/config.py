@@ -102,6 +102,8 @@ class HeadsConfig:
     """Temperature of the InfoNCE losses."""
     text_weight: NotNegative = 1.0
     """Weight of the touch-text loss: lambda in the MMWand paper; 0 leaves it out."""
+    text_hidden: CountOrNone = 512
+    """Width of the hidden layer beside the linear map of sentences; 0 leaves it out."""
 
 
 ALIGN_PRESETS: dict[str, AlignConfig] = {

@@ -7,12 +7,12 @@ W ranks pairs like mapping touch to sentences by W transposed, so the direction 
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.infonce import symmetric_info_nce
+from touchgoal.encoders.backbones.tower_map import TowerMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,27 +27,12 @@ class PairedEmbeddings:
 
 
 class Heads(nn.Module):
-    """Bias-free linear maps from image and sentence embeddings to touch; all are unit vectors."""
+    """Maps from image and sentence embeddings to touch; all give unit vectors."""
 
-    image_mean: Float[Tensor, " i"]
-    text_mean: Float[Tensor, " t"]
-
-    def __init__(self, touch_dim: int, image_dim: int, text_dim: int) -> None:
+    def __init__(self, touch_dim: int, image_dim: int, text_dim: int, text_hidden: int) -> None:
         super().__init__()
-        self.image, self.text = (
-            nn.Linear(image_dim, touch_dim, False),
-            nn.Linear(text_dim, touch_dim, False),
-        )
-        self.register_buffer("image_mean", torch.zeros(image_dim))
-        self.register_buffer("text_mean", torch.zeros(text_dim))
-
-    def images(self, embeddings: Float[Tensor, "*n i"]) -> Float[Tensor, "*n d"]:
-        """Map image embeddings to touch embeddings."""
-        return F.normalize(self.image(F.normalize(embeddings, dim=-1) - self.image_mean), dim=-1)
-
-    def texts(self, embeddings: Float[Tensor, "*n t"]) -> Float[Tensor, "*n d"]:
-        """Map sentence embeddings to touch embeddings."""
-        return F.normalize(self.text(F.normalize(embeddings, dim=-1) - self.text_mean), dim=-1)
+        self.image = TowerMap(image_dim, touch_dim)
+        self.text = TowerMap(text_dim, touch_dim, text_hidden)
 
 
 def fit_heads(data: PairedEmbeddings, config: HeadsConfig, seed: int) -> Heads:
@@ -56,11 +41,12 @@ def fit_heads(data: PairedEmbeddings, config: HeadsConfig, seed: int) -> Heads:
     Touches, views and sentences of the same object all count as positives.
     """
     draw = torch.Generator().manual_seed(seed)
+    dims = data.touch.shape[1], data.image.shape[2], data.texts.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        heads = Heads(data.touch.shape[1], data.image.shape[2], data.texts.shape[1])
-    heads.image_mean.copy_(F.normalize(data.image, dim=-1).mean((0, 1)))
-    heads.text_mean.copy_(F.normalize(data.texts, dim=-1).mean(0))
+        heads = Heads(*dims, config.text_hidden)
+    heads.image.centre(data.image)
+    heads.text.centre(data.texts)
     optimizer = torch.optim.AdamW(heads.parameters(), config.lr, weight_decay=config.weight_decay)
     n = len(data.touch)
     steps = max(n // config.batch_size, 1) * config.epochs
@@ -83,11 +69,11 @@ def _loss(
 ) -> Float[Tensor, ""]:
     """Return the loss of a batch; touches without views take part in touch and text alone."""
     sentence, label, tau = _draw_sentences(data, rows, draw), data.label[rows], config.temperature
-    touch, text = data.touch[rows], heads.texts(data.texts[sentence])
+    touch, text = data.touch[rows], heads.text(data.texts[sentence])
     same = (label[:, None] == label) | (sentence[:, None] == sentence)
     viewed = rows < len(data.image)
     view = torch.randint(data.image.shape[1], (int(viewed.sum()),), generator=draw)
-    image, both = heads.images(data.image[rows[viewed], view]), same[viewed][:, viewed]
+    image, both = heads.image(data.image[rows[viewed], view]), same[viewed][:, viewed]
     loss = symmetric_info_nce(touch[viewed], image, tau, both)
     loss = loss + symmetric_info_nce(image, text[viewed], tau, both)
     if config.text_weight:

@@ -78,12 +78,16 @@ class WandSet:
         pictures = [(*self.pictures(int(i)), self.view(int(i))) for i in reading]
         untouched, touched, views = (np.stack(kind) for kind in zip(*pictures, strict=True))
         index = np.arange(len(rows))
-        of = {
+        objects = tuple(self.names[i] for i in self.label[rows])
+        sentences = self.sentences_by_object()
+        return Touches(touched, untouched, index, views, index, objects, sentences)
+
+    def sentences_by_object(self) -> dict[str, list[str]]:
+        """Return the sentences on each object."""
+        return {
             name: [s for s, on in zip(self.sentences, own, strict=True) if on]
             for name, own in zip(self.names, self.describes, strict=True)
         }
-        objects = tuple(self.names[i] for i in self.label[rows])
-        return Touches(touched, untouched, index, views, index, objects, of)
 
     def embed_touches(
         self, embed: Callable[[Pictures, Picture], Float32[np.ndarray, "_ d"]]

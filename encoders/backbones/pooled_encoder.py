@@ -14,10 +14,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
+from touchgoal.encoders.backbones.tower_map import TowerMap
 from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
+from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
-from touchgoal.encoders.whitening.text_head import TextHead
 
 # Blocks after which the image is pooled, and channels there: edges, textures, parts. Later blocks are
 # specific to ImageNet's classes and separate touches less well.
@@ -45,6 +45,7 @@ class PooledEncoderConfig:
     # `Towers.name` of the towers whose sentences and images it embeds; None without them
     towers: str | None = None
     text_dim: int = 0  # width of their text embeddings
+    text_hidden: int = 0  # hidden layer of the map of sentences; 0: linear
     image_dim: int = 0  # width of their image embeddings; 0 without images
     last_block: int = STAGES[-1][0]  # last block of the network that is used
 
@@ -75,24 +76,22 @@ class PooledEncoder(BaseTouchEncoder):
 
     mean: Float[Tensor, " d"]
     whitening: Float[Tensor, "d d"]
-    text_mean: Float[Tensor, " t"]
-    text_matrix: Float[Tensor, "t d"]
-    image_mean: Float[Tensor, " i"]
-    image_matrix: Float[Tensor, "i d"]
 
-    def __init__(self, config: PooledEncoderConfig) -> None:
+    def __init__(
+        self, config: PooledEncoderConfig, network: EfficientNetLite0 | None = None
+    ) -> None:
+        """Build it without whitening; `network`: None for ImageNet's weights."""
         preprocess = preprocessor_for(config.sensor, config.preprocessor_version)
         super().__init__(preprocess, config.features)
         self.config, self._scale = config, preprocess.scale
         self.register_buffer("mean", torch.zeros(config.features))
         self.register_buffer("whitening", torch.eye(config.features))
         if config.towers is not None:
-            self.register_buffer("text_mean", torch.zeros(config.text_dim))
-            self.register_buffer("text_matrix", torch.zeros(config.text_dim, config.features))
+            self.text_map = TowerMap(config.text_dim, config.features, config.text_hidden)
         if config.image_dim:
-            self.register_buffer("image_mean", torch.zeros(config.image_dim))
-            self.register_buffer("image_matrix", torch.zeros(config.image_dim, config.features))
-        self._network = [load_efficientnet_lite0()]  # in a list: no part of the state
+            self.image_map = TowerMap(config.image_dim, config.features)
+        self.requires_grad_(False)
+        self._network = [network or load_efficientnet_lite0()]  # in a list: no part of the state
 
     @property
     def device(self) -> torch.device:
@@ -106,11 +105,11 @@ class PooledEncoder(BaseTouchEncoder):
 
     def project_text(self, embeddings: Float[Tensor, "n t"]) -> Float[Tensor, "n d"]:
         """See BaseTouchEncoder."""
-        return TextHead(self.text_mean, self.text_matrix)(embeddings)
+        return self.text_map(embeddings)
 
     def project_image(self, embeddings: Float[Tensor, "n i"]) -> Float[Tensor, "n d"]:
         """Map the image tower's embeddings to touch, as unit vectors; only with `image_dim`."""
-        return TextHead(self.image_mean, self.image_matrix)(embeddings)
+        return self.image_map(embeddings)
 
     @property
     def covariance(self) -> Float[np.ndarray, "d d"]:

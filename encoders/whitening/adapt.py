@@ -34,7 +34,7 @@ def adapt(
     names = np.repeat(objects, [len(rows) for rows in pooled])
     covariance = (1 - share) * encoder.covariance + share * within_classes(every, names)
     # Words and pictures of the old whitening would lie elsewhere in the new one.
-    plain = replace(encoder.config, towers=None, text_dim=0, image_dim=0)
+    plain = replace(encoder.config, towers=None, text_dim=0, text_hidden=0, image_dim=0)
     adapted = PooledEncoder(plain).fit(every.mean(0), inverse_square_root(covariance, 0.0))
     ranked = [i for i, video in enumerate(videos) if video.ranks is not None]
     if not ranked:
@@ -43,9 +43,8 @@ def adapt(
     directions = [F.normalize(adapted.whiten(pooled[i]), dim=1).mean(0) for i in ranked]
     head = fit_text_head(torch.stack(directions), ranks, towers.embed_texts)
     worded = PooledEncoder(replace(plain, towers=towers.name, text_dim=towers.text_dim))
-    worded.load_state_dict(
-        {**adapted.state_dict(), "text_mean": head.mean, "text_matrix": head.matrix}
-    )
+    worded.load_state_dict(adapted.state_dict(), strict=False)
+    worded.text_map = head
     return worded
 
 

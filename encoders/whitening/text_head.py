@@ -6,12 +6,13 @@ describes.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from touchgoal.encoders.backbones.tower_map import TowerMap
 
 RANK_WORDS = (
     ("soft", "slightly hard", "hard"),
@@ -24,18 +25,6 @@ _STRENGTH = 0.003  # of the ridge; on real objects, 100 times more or less chang
 EmbedTexts = Callable[[list[str]], Float[Tensor, "k t"]]
 
 
-@dataclass(frozen=True, eq=False)
-class TextHead:
-    """Linear map from a text tower's embeddings to touch."""
-
-    mean: Float[Tensor, " t"]  # mean of the unit text embeddings
-    matrix: Float[Tensor, "t d"]  # map from centred text embeddings to touch
-
-    def __call__(self, texts: Float[Tensor, "n t"]) -> Float[Tensor, "n d"]:
-        """Return unit vectors among the touch embeddings."""
-        return F.normalize((F.normalize(texts, dim=1) - self.mean) @ self.matrix, dim=1)
-
-
 def rank_sentences(property_: int) -> list[str]:
     """Return the sentences for the three ranks of a property."""
     return [f"a {word} object" for word in RANK_WORDS[property_]]
@@ -43,7 +32,7 @@ def rank_sentences(property_: int) -> list[str]:
 
 def fit_text_head(
     touches: Float[Tensor, "n d"], ranks: Int[Tensor, "n 3"], embed_texts: EmbedTexts
-) -> TextHead:
+) -> TowerMap:
     """Fit a ridge from sentences to the mean of the centred touches that each describes."""
     sentences, places, weights = [], [], []
     for property_ in range(ranks.shape[1]):
@@ -67,4 +56,7 @@ def fit_text_head(
     # The dual form: far fewer sentences than numbers in each.
     inner = apart @ apart.T + _STRENGTH * torch.diag(1 / weight)
     matrix = apart.T @ torch.linalg.solve(inner, torch.stack(places).double())
-    return TextHead(mean.float(), matrix.float())
+    head = TowerMap(texts.shape[1], touches.shape[1])
+    head.mean.copy_(mean)
+    head.linear.weight.data.copy_(matrix.T)
+    return head.requires_grad_(False)

@@ -48,7 +48,7 @@ class Config(BenchmarkOptions):
     data: Path = field(kw_only=True)
     """Touches recorded by `collect-touches --body wand`, or vt60's folder (real touches of a dome; it
     uses its own networks and, of the options below, only `cache` and `seed`)."""
-    encoders: tuple[str, ...] = ("gelsight_mini_surfaces", "gelsight_mini", "random:gelsight_mini")
+    encoders: tuple[str, ...] = ("gelsight_mini", "random:gelsight_mini")
     """Touch encoders: see benchmark real-touch."""
     splits: tuple[Literal["sample", "press"], ...] = ("sample", "press")
     """Units held out; whole objects cannot be, because an unseen object has no name to find."""

@@ -48,15 +48,7 @@ def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> 
         UserError: no such set or encoder, or touches without views.
     """
     data, towers = WandSet.open(root), load_towers("offline")
-    made = {
-        name: _cached(
-            cache,
-            data,
-            f"touch {name} {seed}",
-            lambda n=name: data.embed_touches(find_embedder(n, seed)),
-        )
-        for name in encoders
-    }
+    made = {name: _embed_touches(name, seed, data, cache) for name in encoders}
     return EmbeddedSet(
         names=data.names,
         sensor=find_sensor_name(None, data.episodes),
@@ -69,6 +61,14 @@ def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> 
         touch=made,
         pixels=_cached(cache, data, f"pixels {_SMALL}", lambda: _pixels(data)),
     )
+
+
+def _embed_touches(name: str, seed: int, data: WandSet, cache: Path) -> Float32[np.ndarray, "n d"]:
+    """Embed all touches. The first one's embedding names the cache: an encoder's name may get new weights."""
+    embed = find_embedder(name, seed)
+    untouched, touched = data.pictures(0)
+    first = hashlib.sha256(embed(touched[None], untouched).tobytes()).hexdigest()
+    return _cached(cache, data, f"touch {first}", lambda: data.embed_touches(embed))
 
 
 def _cached(cache: Path, data: WandSet, what: str, make: Callable[[], np.ndarray]) -> np.ndarray:

@@ -64,7 +64,7 @@ def run_other_set(
                 touch = F.normalize(torch.from_numpy(judged.touch[name]), dim=1)
                 _count(hits.setdefault(what, {}), touch, fitted, judged, seen, seed)
                 if trained_on is judged and name == encoders[0]:
-                    image = fitted.images(torch.from_numpy(judged.image)).mean(1).detach()
+                    image = fitted.image(torch.from_numpy(judged.image)).mean(1).detach()
                     _count(hits.setdefault("images", {}), image, fitted, judged, seen, seed)
     rows = [
         {"row": what, **{k: mean_over_objects(*_joined(v)) for k, v in found.items()}}
@@ -113,7 +113,7 @@ def _count(
     seed: int,
 ) -> None:
     """Add, by column of the table, the object and the hit of each touch that is judged."""
-    texts = heads.texts(torch.from_numpy(data.texts)).detach()
+    texts = heads.text(torch.from_numpy(data.texts)).detach()
     similarity = (F.normalize(embedded, dim=1) @ texts.T).numpy()
     held_out = split_touches("press", data.label, data.visit, data.describes, seed).test
     rng = np.random.default_rng([seed, 7])

@@ -52,7 +52,7 @@ class Config(BenchmarkOptions):
     data: Path = field(kw_only=True)
     """Touches recorded by `collect-touches --body wand`, or vt60's folder (real touches of a dome; it
     uses its own networks and, of the options below, only `cache` and `seed`)."""
-    encoders: tuple[str, ...] = ("gelsight_mini_surfaces", "gelsight_mini", "random:gelsight_mini")
+    encoders: tuple[str, ...] = ("gelsight_mini", "random:gelsight_mini")
     """Touch encoders: see benchmark real-touch."""
     splits: tuple[Split, ...] = SPLITS
     """Units held out: single touches (sample), visits (press), objects or sentences."""
@@ -111,8 +111,8 @@ def _with_heads(data: EmbeddedSet, fold: Fold, seed: int, name: str, config: Hea
     )
     heads = fit_heads(paired, config, seed)
     with torch.no_grad():
-        image = heads.images(torch.from_numpy(data.image[fold.test])).mean(1)
-        text = heads.texts(torch.from_numpy(data.texts[fold.test_text]))
+        image = heads.image(torch.from_numpy(data.image[fold.test])).mean(1)
+        text = heads.text(torch.from_numpy(data.texts[fold.test_text]))
     unit = F.normalize(image, dim=1)
     return judge(
         data, fold, {"touch": touch[fold.test].numpy(), "image": unit.numpy(), "text": text.numpy()}

@@ -1,6 +1,7 @@
 """Materials of real objects by sentences, never trained on: MMWand's Table III, on ObjectFolder Real.
 
-With --other: the same table on touches of the wand, see `other_set`.
+With --other: the same table on touches of the wand, see `other_set`. On episodes in which objects are
+grasped: the objects in place of materials, see `grasped_objects`.
 
 A touch gets the material whose sentences are nearest on average. The gel's untouched picture is
 the median of all touches, because none is published.
@@ -14,16 +15,18 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.benchmarks.options import BenchmarkOptions
+from touchgoal.benchmarks.papers.mmwand.grasped_objects import run_grasped_objects
 from touchgoal.benchmarks.papers.mmwand.other_set import run_other_set
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers
+from touchgoal.episodes.format import set_files
 from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
     read_objectfolder_real,
     read_touches,
 )
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.option_types import Count, checked_dataclass
+from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 
 SENTENCES = {
     "ceramic": ("hard, smooth glazed ceramic", "a smooth and hard object like porcelain"),
@@ -43,8 +46,8 @@ class Config(BenchmarkOptions):
     """Options of benchmark zero-shot."""
 
     data: Path = field(kw_only=True)
-    """Folder of ObjectFolder Real, with objects.csv and touch/; or touches of the wand recorded with
-    another sensor than those of --other."""
+    """Folder of ObjectFolder Real, with objects.csv and touch/; episodes of `collect-demos`; or touches of
+    the wand recorded with another sensor than those of --other."""
     other: Path | None = None
     """Touches of the wand to train on as well: who trains on one sensor is judged on the other."""
     encoders: tuple[str, ...] = ("gelsight_mini",)
@@ -56,6 +59,8 @@ class Config(BenchmarkOptions):
     """Training of the heads on touches of the wand."""
     cache: Path = Path("runs/mmwand-embeddings")
     """Folder that keeps the embeddings of the wand's touches."""
+    seed: Seed = 0
+    """Random seed of the frames of grasps."""
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -63,6 +68,8 @@ def run(config: Config) -> dict[str, Any]:
     if config.other is not None:
         rest = config.heads, config.seeds, config.cache
         return run_other_set(config.data, config.other, config.encoders, *rest)
+    if (config.data / set_files.INFO).exists():
+        return run_grasped_objects(config.data, config.encoders, config.seed)
     objects = read_objectfolder_real(config.data)
     touches, untouched = read_touches(objects)
     labelled = [i for i, item in enumerate(objects) if item.material is not None]
@@ -75,7 +82,7 @@ def run(config: Config) -> dict[str, Any]:
     for name in config.encoders:
         encoder = load_encoder(name).eval()
         if encoder.towers is None:
-            raise UserError(f"{name} has no words: choose an encoder that `align` or `adapt` made")
+            raise UserError(f"{name} has no words: choose an encoder that `align` or `words` made")
         towers = load_towers(encoder.towers)
         touch = encoder.embed_frames(touches[labelled], untouched)
         text = encoder.embed_text_goal(sentences, towers)
