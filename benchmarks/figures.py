@@ -125,7 +125,9 @@ def named(metrics: Metrics, **inputs: str) -> str:
 def named_by_sentences(metrics: Metrics) -> str:
     """Share of touches whose object is found by its sentences, by number of candidates; first encoder."""
     row = {key: value for key, value in metrics["rows"][0].items() if key != "encoder"}
-    return "; ".join(f"of {k} {m:.0f} % [{low:.0f}, {high:.0f}]" for k, (m, low, high) in row.items())
+    return "; ".join(
+        f"of {k} {m:.0f} % [{low:.0f}, {high:.0f}]" for k, (m, low, high) in row.items()
+    )
 
 
 def faults(metrics: Metrics) -> str:

@@ -20,7 +20,7 @@ from touchgoal.launch.pull import load_pulled
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, find_policy
 from touchgoal.runtime.errors import UserError
 
-ENCODER = find_encoder("gelsight_mini_surfaces")
+ENCODER = find_encoder("gelsight_mini")
 POLICY = SHIPPED_POLICIES["pick-place"]
 
 

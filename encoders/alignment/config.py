@@ -98,7 +98,7 @@ class HeadsConfig:
     """Highest learning rate; it falls to 0 by a cosine."""
     weight_decay: NotNegative = 0.02
     """Decoupled weight decay."""
-    temperature: Positive = 0.1
+    temperature: Positive = 0.07
     """Temperature of the InfoNCE losses."""
     text_weight: NotNegative = 1.0
     """Weight of the touch-text loss: lambda in the MMWand paper; 0 leaves it out."""
