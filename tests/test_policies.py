@@ -281,7 +281,7 @@ def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
 
 def test_shipped_records_name_no_folder_of_a_machine() -> None:
     records = list(SHIPPED_POLICIES["pick-place"].parent.rglob("*.json"))
-    assert len(records) == 5
+    assert len(records) == 6
     for path in records:
         record = json.loads(path.read_text())
         assert portable(record) == record

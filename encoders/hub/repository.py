@@ -25,8 +25,8 @@ Kind = Literal["encoder", "policy"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 _MODEL_TYPE = "model_type"  # the Hub's key in config.json
-_DATA_FILE = re.compile(r"(\w[\w-]*/)?\w[\w-]*\.(json|safetensors)")
-"""Paths that are pushed and pulled, beside the card: at most one folder deep."""
+_DATA_FILE = re.compile(r"(\w[\w-]*/){0,2}\w[\w-]*\.(json|safetensors)")
+"""Paths that are pushed and pulled, beside the card: at most two folders deep."""
 _LOG_IN = "log in with: hf auth login (or set HF_TOKEN)"
 
 
