@@ -348,10 +348,10 @@ def test_encoder_speed_prints_every_encoder_beside_its_peer(
     pair = replace(PRESETS["tiny"], channels=6)
     backbone = TouchBackbone(TouchBackboneConfig.for_sensor(pair, "gelsight_mini", 2))
     pretrained.save(backbone, tmp_path / "pair", {})
-    run("benchmark", "encoder-speed", "--encoders", tmp_path / "pair", "gelsight_mini_surfaces", "--shapes",
+    run("benchmark", "encoder-speed", "--encoders", tmp_path / "pair", "gelsight_mini", "--shapes",
         "mae-tiny", "--batch-size", 2, "--repeats", 1, "--ticks", 1, "--out", tmp_path / "run")  # fmt: skip
     printed = capsys.readouterr().out
     assert "Sparsh mae-tiny, random" in printed
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
     assert [row["precision"] for row in rows] == ["fp32", "bf16", "fp32", "fp32", "bf16"]
-    assert all((row["batched_ratio"] is None) == ("surfaces" in row["encoder"]) for row in rows)
+    assert all((row["batched_ratio"] is None) == (row["encoder"] == "gelsight_mini") for row in rows)
