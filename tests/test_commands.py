@@ -354,4 +354,6 @@ def test_encoder_speed_prints_every_encoder_beside_its_peer(
     assert "Sparsh mae-tiny, random" in printed
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
     assert [row["precision"] for row in rows] == ["fp32", "bf16", "fp32", "fp32", "bf16"]
-    assert all((row["batched_ratio"] is None) == (row["encoder"] == "gelsight_mini") for row in rows)
+    assert all(
+        (row["batched_ratio"] is None) == (row["encoder"] == "gelsight_mini") for row in rows
+    )
