@@ -56,6 +56,9 @@ class Config:
     audit: CountOrNone = 0
     """Number of trajectories, from the first, whose touch is replaced to see if it mattered. They are
     embedded once more and held in memory; goals must come from other trajectories."""
+    rerun: Path | None = None
+    """Also write cameras, fingertips and curves of the trajectories with a plot to this .rrd file, for
+    the rerun viewer (extra viz)."""
     workers: Count = 2
     """Number of threads that decode ahead of the encoders."""
     device: str = "cpu"
@@ -74,6 +77,7 @@ def main(config: Config) -> None:
     from touchgoal.rewards.report.frame_table import FRAMES
     from touchgoal.rewards.report.page import PAGE
     from touchgoal.rewards.report.report import report_all
+    from touchgoal.rewards.report.rerun_recording import load_rerun, write_recording
     from touchgoal.rewards.reward_model import RewardModel, load_reward_model
     from touchgoal.rewards.sources.open_source import open_source
     from touchgoal.rewards.sources.trajectory import Trajectory
@@ -81,6 +85,8 @@ def main(config: Config) -> None:
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.run_folder import open_run
 
+    if config.rerun is not None:
+        load_rerun()
     use_keys(config.keys)
     with_touch = config.towers is None or config.encoder is not None
     source = open_source(config.source, config.camera, config.index, with_touch, config.fps)
@@ -125,5 +131,8 @@ def main(config: Config) -> None:
     audited = source.trajectories[: config.audit]
     audit = audit_trajectories(audited, model_of).table if audited else ""
     report_all(measurement.records, out, model.provenance(), threshold, audit)
+    if config.rerun is not None:
+        write_recording(config.rerun, source.trajectories[: config.plots], measurement.records)
+        print(f"look at it: rerun {config.rerun}")
     print(f"{summary}; {speed}")
     print(f"next: look at {out / PAGE}; train on {out / FRAMES}")

@@ -235,3 +235,21 @@ def test_page_holds_everything(pages: Callable[..., Path]) -> None:
     assert "curves" not in data_of(index)["episodes"][0]
     assert data_of(index)["episodes"][3]["page"] == "report_002.html#episode_003"
     assert len(data_of(index.with_name("report_002.html"))["episodes"]) == 1
+
+
+def test_a_recording_for_rerun(episodes: Path, tmp_path: Path) -> None:
+    """Read back by rerun itself: pictures of camera and fingertips, and curves, at every frame."""
+    pytest.importorskip("rerun", reason="extra viz")
+    from rerun.chunk import RrdReader  # pyright: ignore[reportMissingImports]
+
+    from touchgoal.rewards.report.rerun_recording import write_recording
+
+    measurement = measure(episodes, tmp_path / "out")
+    trajectories = open_source(episodes, "front").trajectories
+    write_recording(tmp_path / "curves.rrd", trajectories, measurement.records)
+    chunks = list(RrdReader(tmp_path / "curves.rrd").stream())
+    rows: dict[str, int] = {}
+    for chunk in chunks:
+        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+    for part in ("front", "tactile_left", "tactile_right", "curves/cost_image"):
+        assert rows[f"/episode_000/{part}"] == trajectories[0].length
