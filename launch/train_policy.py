@@ -102,6 +102,9 @@ class Config(TrainingOptions):
     position_noise: Annotated[NotNegative, RARE] = 0.3
     """Noise on joint and hand positions in training, where the policy reads them, relative to their
     standard deviation."""
+    action_share: Annotated[Fraction, RARE] = 1.0
+    """Middle share of the actions that the network's range of -1 to 1 covers; below 1, rare large
+    motions do not make all others tiny."""
     observation_horizon: Annotated[Count, RARE] = 2
     """Control ticks that the policy observes, the latest included."""
     execution_horizon: Count = 2
@@ -212,6 +215,7 @@ def _policy_config(
         representation=config.representation,
         observation_horizon=config.observation_horizon,
         execution_horizon=config.execution_horizon,
+        action_share=config.action_share,
         control_hz=episodes.fps,
         head=head,
     )

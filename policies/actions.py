@@ -21,6 +21,7 @@ from touchgoal.policies.config import ActionRepresentation
 ACTION_DIM = N_JOINTS + 1
 
 _MIN_RANGE = 1e-6  # SI units; a component that varies less counts as constant
+_QUANTILE_ROWS = 20_000  # values of each component whose quantiles are taken
 
 
 def to_representation(
@@ -111,16 +112,27 @@ class Normalizer(nn.Module):
         self.register_buffer("scale", torch.ones(shape))
 
     def fit_range(
-        self, values: Float[Tensor, "n ..."], valid: Bool[Tensor, "n ..."] | None = None
+        self,
+        values: Float[Tensor, "n ..."],
+        valid: Bool[Tensor, "n ..."] | None = None,
+        share: float = 1.0,
     ) -> None:
         """Map the least and the greatest of these values to -1 and 1.
 
-        Only `valid` values count, if given; a component without any becomes 0.
+        Only `valid` values count, if given; a component without any becomes 0. With a `share` below
+        1 it is the range of the middle share, so that rare large values do not make the others tiny;
+        a component that varies only outside it, such as a gripper's, keeps the whole range.
         """
         if valid is None:
             valid = torch.ones_like(values, dtype=torch.bool)
         low = values.masked_fill(~valid, torch.inf).amin(0)
         high = values.masked_fill(~valid, -torch.inf).amax(0)
+        if share < 1.0:
+            some = values.masked_fill(~valid, torch.nan)[:: max(1, len(values) // _QUANTILE_ROWS)]
+            ends = torch.tensor([(1 - share) / 2, (1 + share) / 2])
+            inner = torch.nanquantile(some.flatten(1), ends, dim=0).unflatten(1, values.shape[1:])
+            wide = inner[1] - inner[0] > _MIN_RANGE
+            low, high = torch.where(wide, inner[0], low), torch.where(wide, inner[1], high)
         none = ~valid.expand_as(values).any(0)
         low, high = low.masked_fill(none, 0.0), high.masked_fill(none, 0.0)
         self._set((low + high) / 2, (high - low) / 2)

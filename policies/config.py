@@ -45,6 +45,9 @@ class SamplerConfig:
     """Network calls for one plan. Two suffice for ddim with sample, not for ddpm with epsilon."""
     clip: Positive = 1.0
     """Largest magnitude of a clean sample, normalised."""
+    loss: Literal["squared", "absolute"] = "squared"
+    """Error of the network in training: squared, as published, or absolute, which weighs rare large
+    motions less."""
 
     def __post_init__(self) -> None:
         if self.prediction_type == ("epsilon" if self.kind == "flow" else "velocity"):

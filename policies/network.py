@@ -62,6 +62,8 @@ class PolicyConfig:
     prediction_horizon: int = 8
     execution_horizon: int = 2  # ticks of a plan that are executed before the next one
     representation: ActionRepresentation = "relative"  # of the actions in training
+    # middle share of the training's actions that the head's range of -1 to 1 covers
+    action_share: float = 1.0
     control_hz: int = ft.CONTROL_HZ  # ticks per second
     # predicts the plan
     head: DiffusionConfig | RegressionConfig = field(default_factory=DiffusionConfig)
@@ -187,7 +189,8 @@ class PolicyNetwork(nn.Module):
         columns, kind = self.config.proprioception, self.config.representation
         self.state_normalizer.fit_mean_std(network_input(state, columns, kind))
         valid = None if action_is_pad is None else ~action_is_pad[..., None]
-        self.action_normalizer.fit_range(to_representation(actions, joints, kind), valid)
+        chunks = to_representation(actions, joints, kind)
+        self.action_normalizer.fit_range(chunks, valid, self.config.action_share)
 
     def loss(
         self,

@@ -330,3 +330,15 @@ def test_a_pause_at_the_start_is_reported_and_left_out(
     assert "1 of 1 episodes begin with a pause of 0.8 to 0.8 s" in capsys.readouterr().out
     trimmed = load_recordings(episodes, [0], config, None, skip=pauses)
     assert trimmed.lengths == (15,) and trimmed.actions.unique().tolist() == [pytest.approx(0.1)]
+
+
+def test_rare_large_values_leave_the_range_to_the_others() -> None:
+    values = torch.linspace(-1, 1, 1001)[:, None, None].repeat(1, 2, 2)
+    values[::200, :, 0] *= 50.0
+    values[:, :, 1] = 0.0
+    values[::500, :, 1] = 0.08  # varies only rarely, like a gripper's width
+    normalizer = Normalizer((2, 2))
+    normalizer.fit_range(values, share=0.98)
+    scaled = normalizer(values)
+    assert scaled[500 - 450, 0, 0].item() == pytest.approx(-0.9 / 0.98, abs=0.02)
+    assert scaled[:, 0, 1].unique().tolist() == [-1.0, 1.0]

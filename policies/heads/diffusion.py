@@ -37,10 +37,11 @@ class Diffusion(nn.Module):
         noise: BatchNoise,
         is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Return the mean squared error at random steps, without padded ticks."""
-        noisy, step, target = add_noise(self.config.sampler, chunk, noise)
-        error = (self.network(noisy, step, condition) - target).square()
-        return masked_mean(error, is_pad)
+        """Return the mean error at random steps, without padded ticks."""
+        sampler = self.config.sampler
+        noisy, step, target = add_noise(sampler, chunk, noise)
+        error = self.network(noisy, step, condition) - target
+        return masked_mean(error.abs() if sampler.loss == "absolute" else error.square(), is_pad)
 
     def sample(
         self, condition: Float[Tensor, "b c"], generator: torch.Generator
