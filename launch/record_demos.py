@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from touchgoal.control.features import CAMERA_SHAPE, CONTROL_HZ
+from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import DeviceName
-from touchgoal.control.teleoperation.teleoperator import TeleoperationConfig
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import RARE, Count, Seed, checked_dataclass
 

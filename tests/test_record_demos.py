@@ -25,11 +25,12 @@ from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.sensors.keyboard import Keyboard
+from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import HandMotion, Verdict
 from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
 from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
-from touchgoal.control.teleoperation.teleoperator import TeleoperationConfig, Teleoperator
+from touchgoal.control.teleoperation.teleoperator import Teleoperator
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch import record_demos
 from touchgoal.launch.__main__ import main

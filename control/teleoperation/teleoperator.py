@@ -4,11 +4,9 @@ Its actions pass the control loop's safety layer like any policy's.
 """
 
 from collections.abc import Callable
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
@@ -16,26 +14,12 @@ from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix
 from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import TeleoperationDevice
-from touchgoal.runtime.option_types import NotNegative, checked_dataclass
 
 # N and Nm beyond the first reading that count as none: the weight of a carried object, and the drift
 # of an arm's own estimate.
 _FREE_FORCE, _FREE_TORQUE = 3.0, 0.3
-
-
-@checked_dataclass
-class TeleoperationConfig:
-    """Response of the hand to a device."""
-
-    speed: Annotated[float, Field(gt=0, le=0.5)] = 0.1
-    """Speed of the hand at full deflection, m/s; a keyboard knows no other."""
-    turn_speed: Annotated[float, Field(gt=0, le=2)] = 0.6
-    """Turning speed of the hand at full deflection, rad/s."""
-    compliance: Annotated[NotNegative, Field(le=0.01)] = 2e-3
-    """Speed per force at which the hand yields beyond 3 N, m/s per N; much more oscillates."""
-    rotational_compliance: Annotated[NotNegative, Field(le=5)] = 0.5
-    """Turning speed per torque at which it yields beyond 0.3 Nm, rad/s per Nm."""
 
 
 class Teleoperator(Actor):
