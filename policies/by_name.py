@@ -25,6 +25,7 @@ BUILT_IN = {
     "follower": "bead-maze: classical control from the force on the hand",
     "shipped": "the policy that ships for the task",
     **{name: f"the policy that ships for {name}" for name in SHIPPED_POLICIES},
+    "bead-maze-diffusion": "the maze by diffusion on the frozen touch embedding",
 }
 """Names of policies, and what they are."""
 

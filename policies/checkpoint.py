@@ -25,6 +25,9 @@ TOUCH, ESTIMATOR = "touch", "estimator"  # folders beside a policy's weights
 _WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED_POLICIES = {"pick-place": _WEIGHTS / "pick_place", "bead-maze": _WEIGHTS / "bead_maze"}
 """The shipped policies: each is named after its task."""
+FURTHER_POLICIES = {"bead-maze-diffusion": _WEIGHTS / "bead_maze_diffusion"}
+"""Further shipped policies: the maze by diffusion on the frozen touch embedding itself, trained
+without the simulator's truth."""
 POLICY_FORMAT = WeightsFormat("policy", "policy", "train one with: touchgoal train-policy")
 
 
@@ -110,8 +113,8 @@ def load_policy(name_or_path: str | Path, plan_ticks: int = 0) -> LearnedPolicy:
     """Load a policy to act with.
 
     Args:
-        name_or_path: name of a shipped policy ("pick-place", "bead-maze"), or a folder that
-            train-policy made.
+        name_or_path: name of a shipped policy ("pick-place", "bead-maze", "bead-maze-diffusion"),
+            or a folder that train-policy made.
         plan_ticks: control ticks by which its plans come late, see `LearnedPolicy`.
 
     Raises:
@@ -123,15 +126,15 @@ def load_policy(name_or_path: str | Path, plan_ticks: int = 0) -> LearnedPolicy:
 def find_policy(name_or_path: str | Path) -> Path:
     """Return the folder of a shipped policy or of one on disk; UserError if there is none."""
     name = str(name_or_path)
-    if name in SHIPPED_POLICIES:
-        return SHIPPED_POLICIES[name]
+    if shipped := (SHIPPED_POLICIES | FURTHER_POLICIES).get(name):
+        return shipped
     for folder in (Path(name), Path(name) / "policy"):  # train-policy's --out, too
         if POLICY_FORMAT.weights_path(folder).is_file():
             return folder
     raise UserError(f"there is no policy {name!r}: {suggestion(name)}")
 
 
-def suggestion(name: str, names: tuple[str, ...] = tuple(SHIPPED_POLICIES)) -> str:
+def suggestion(name: str, names: tuple[str, ...] = (*SHIPPED_POLICIES, *FURTHER_POLICIES)) -> str:
     """Return the end of a message about an unknown policy: the nearest name, and what there is."""
     close = get_close_matches(name, names, 1)
     guess = f"did you mean {close[0]}? " if close else ""
