@@ -9,7 +9,7 @@ CODE := runtime control sim_envs episodes encoders rewards policies benchmarks l
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy pick-place-policy clean
+.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy maze-diffusion-policy pick-place-policy clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -105,10 +105,16 @@ pick-place-policy: $(READY)
 	rm -rf policies/weights/pick_place && cp -r runs/pick_place/policy/policy policies/weights/pick_place
 
 maze-policy: $(READY)
-	$(BIN)/touchgoal make-policy --task bead-maze --learn-touch --out runs/maze
+	$(BIN)/touchgoal make-policy --task bead-maze --wrench --learn-touch --out runs/maze
 	rm -rf policies/weights/bead_maze && cp -r runs/maze/policy/policy policies/weights/bead_maze
 	mv policies/weights/bead_maze/touch/* encoders/weights/gelsight_mini_markers_mae/
 	rmdir policies/weights/bead_maze/touch
+
+maze-diffusion-policy: $(READY)
+	$(BIN)/touchgoal make-policy --task bead-maze --out runs/maze_diffusion
+	rm -rf policies/weights/bead_maze_diffusion
+	cp -r runs/maze_diffusion/policy/policy policies/weights/bead_maze_diffusion
+	rm -r policies/weights/bead_maze_diffusion/touch
 
 $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV): about 1 GB from PyPI, 2 to 3 minutes"

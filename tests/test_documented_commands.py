@@ -25,6 +25,7 @@ from documented_commands import (
     recipes,
     snippets,
 )
+from test_own_object import write_box
 
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.twin_client import ask_twin
@@ -50,6 +51,7 @@ def test_command_is_understood(
     command: Command, capsys: pytest.CaptureFixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    write_box(tmp_path / "mug.obj", (0.08, 0.05, 0.06))  # which docs/own_object.md names
     words = command.words
     if words[0] == "make":
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
@@ -68,7 +70,15 @@ def test_command_is_understood(
 
 
 @pytest.mark.parametrize(
-    "target", ["demo", "weights", "weights-markers", "maze-policy", "pick-place-policy"]
+    "target",
+    [
+        "demo",
+        "weights",
+        "weights-markers",
+        "maze-policy",
+        "maze-diffusion-policy",
+        "pick-place-policy",
+    ],
 )
 def test_recipes_of_the_makefile_are_understood(
     target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
