@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 
 from in_process import in_process_workers
@@ -83,7 +84,8 @@ class Command:
             option, *values = option.split()
             if option in words:
                 start = words.index(option) + 1
-                words[start : start + len(values)] = values
+                given = list(takewhile(lambda word: not word.startswith("--"), words[start:]))
+                words[start : start + len(given)] = values
             else:
                 words += [option, *values]
         return words

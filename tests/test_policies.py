@@ -25,6 +25,7 @@ from touchgoal.policies.evaluation.evaluate import evaluate, run_trials, trial_s
 from touchgoal.policies.evaluation.report import film_trials
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.evaluation.table import table
+from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.training.training_data import choose_episodes, common_sensor, find_task
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.folder_lock import FolderLock
@@ -281,7 +282,7 @@ def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
 
 def test_shipped_records_name_no_folder_of_a_machine() -> None:
     records = list(SHIPPED_POLICIES["pick-place"].parent.rglob("*.json"))
-    assert len(records) == 6
+    assert len(records) == 8
     for path in records:
         record = json.loads(path.read_text())
         assert portable(record) == record
@@ -294,3 +295,9 @@ def test_the_films_show_the_trials(tmp_path: Path) -> None:
     frames, fps = read_frames(tmp_path / "worst.mp4")
     assert fps == 10 and len(frames) == 6
     assert sorted(p.name for p in tmp_path.iterdir()) == ["best.mp4", "worst.mp4"]
+
+
+def test_the_maze_by_diffusion_knows_no_truth_of_the_simulator() -> None:
+    config = load_policy("bead-maze-diffusion").config
+    assert isinstance(config.head, DiffusionConfig)
+    assert config.touch_input == "embedding" and not config.reads_wrench and not config.estimated

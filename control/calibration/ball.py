@@ -76,6 +76,7 @@ class DepthErrors:
 
     radius: float  # radius of the sphere in the depth map over the ball's
     residual: float  # root mean square distance of the depth map from that sphere, m
+    peak_offset: float  # distance of its deepest point from the contact's centre, m
 
 
 def sphere_in(depth: Map, pitch: float, circle: Circle, ball_radius: float) -> DepthErrors:
@@ -100,4 +101,5 @@ def sphere_in(depth: Map, pitch: float, circle: Circle, ball_radius: float) -> D
     return DepthErrors(
         radius=float(found[2] / ball_radius),
         residual=float(np.sqrt(np.mean(residual(found) ** 2))),
+        peak_offset=float(np.hypot(found[0] - x * pitch, found[1] - y * pitch)),
     )
