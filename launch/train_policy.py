@@ -239,7 +239,8 @@ def _image_input(config: Config, episodes: "EpisodeSet") -> "ImageInputConfig | 
         raise UserError(
             f"the cameras' images have several sizes: {sorted(sizes)}; choose one camera"
         )
-    return ImageInputConfig(keys, *sizes)
+    height, width = sizes.pop()
+    return ImageInputConfig(keys, (height, width))
 
 
 def _env(config: Config, task: TaskName) -> TaskConfig:

@@ -56,7 +56,7 @@ def test_the_cost_to_a_goal_as_reward(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_ppo_and_sac_train_as_they_are() -> None:
     env = touchgoal.make("pick-place", for_rl=True, touch="embedding", cameras=(), **SHORT)
-    assert env.reset(seed=0)[0]["touch"].shape == (2 * 256,)
+    assert env.reset(seed=0)[0]["touch"].shape == (2 * 464,)
     SAC("MultiInputPolicy", env, learning_starts=16, buffer_size=100).learn(32)
     blind = touchgoal.make("pick-place", for_rl=True, tactile=False, cameras=(), **SHORT)
     model = PPO("MultiInputPolicy", blind, n_steps=256, n_epochs=1).learn(1000)

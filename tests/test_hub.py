@@ -148,7 +148,7 @@ def test_other_peoples_files_are_refused_and_no_code_is_downloaded(
     ):
         hub.repositories["lab/model"] = sound | changes
         assert message in refusal(hub, tmp_path), changes
-    code = {"modeling.py": b"1/0", "a.pt": b"", "../evil.json": b"{}", "a/b/c.json": b"{}"}
+    code = {"modeling.py": b"1/0", "a.pt": b"", "../evil.json": b"{}", "a/b/c/d.json": b"{}"}
     hub.repositories["lab/model"] = sound | code
     with pulled("lab/model", tmp_path, api(hub)) as (folder, _):
         assert set(files(folder)) == {*files(ENCODER), "README.md"}

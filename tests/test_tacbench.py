@@ -262,7 +262,9 @@ def test_the_benchmark_judges_every_encoder(
     for row in [*result["rows"], *shared_out]:
         row.pop("seconds", None)
     assert shared_out == [row for row in result["rows"] if row["task"] == "slip"]
-    wrong = Config(encoders=("gelsight_mini",), rig=RIG, data=strokes.parent)
+    plain = TouchBackboneConfig.for_sensor(PRESETS["tiny"], "gelsight_mini")
+    save(TouchBackbone(plain), tmp_path / "plain", {})
+    wrong = Config(encoders=(str(tmp_path / "plain"),), rig=RIG, data=strokes.parent)
     with pytest.raises(UserError, match="the rig has gelsight_mini_markers"):
         run(wrong)
 
