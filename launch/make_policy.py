@@ -27,9 +27,10 @@ _DEPLOYED = shlex.split(  # delays wider than measured on the wire: see `Deploym
 _NO_IMAGES = ["--env.no-tactile", "--env.cameras"]
 _REGRESSION = ["--head", "regression"]
 # One step of five: on validation wires two of a hundred led 22 of 40 beads to the end, one 29 to 31,
-# this 33. Fresh noise at every plan makes successive plans disagree.
+# this 33. Fresh noise at every plan makes successive plans disagree. With less noise on touch, or for
+# longer, the errors on validation wires rise.
 _MAZE_DIFFUSION = shlex.split(
-    "--head small --sampler.loss absolute --sampler.num-train-timesteps 5 "
+    "--head small --touch-noise 0.5 --sampler.loss absolute --sampler.num-train-timesteps 5 "
     "--sampler.num-inference-steps 1 --sampler.clip 2 --action-share 0.98"
 )
 _MAZE_TOUCH = "gelsight_mini_markers_mae"
@@ -55,8 +56,8 @@ class Config:
     """Rounds of DAgger: the policy acts, the expert's actions are recorded, the policy is trained again;
     default and maximum: 5 for pick-place, 3 for the maze."""
     epochs: Count | None = None
-    """Passes over the data in each training; default: 16 for pick-place, 3 for the maze, 5
-    with --wrench."""
+    """Passes over the data in each training; default: 16 for pick-place, 5 for the maze, 3
+    for its diffusion."""
     trials: CountOrNone = 24
     """Validation episodes in which every snapshot of the last training is tried; 0 takes the last."""
     wrench: Annotated[bool, RARE] = False
@@ -146,7 +147,9 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
         steps.append(_record(out / "train", disturbed, seed, [*feedback, *pushed], config))
     # The third round is in the plain environment, where nothing is late or estimated.
     envs = [deployed, deployed, _NO_IMAGES, deployed, deployed]
-    return steps + _corrected(config, out, learn, _REGRESSION, envs, config.corrections or 200)
+    return steps + _corrected(
+        config, out, learn, _REGRESSION, _REGRESSION, envs, config.corrections or 200
+    )
 
 
 def _bead_maze(config: Config, out: Path) -> list[list[str]]:
@@ -158,22 +161,22 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     touch = out / "touch" if config.learn_touch else config.touch
     learn = shlex.split(  # Observing two ticks it led the bead less often on validation wires.
         "--representation body_twist --arm-state commanded --train.lr 1e-3 --env.start-angle 10 "
-        "--task bead-maze --observation-horizon 4 "
-        f"--train.snapshot-epochs 5 --train.epochs {config.epochs or (5 if config.wrench else 3)}"
+        "--task bead-maze --observation-horizon 4 --train.snapshot-epochs 5"
     )
     learn += ["--encoder", str(touch / "encoder") if touch else _MAZE_TOUCH]
-    head: list[str] = _REGRESSION
-    if config.wrench:
-        learn += ["--touch-input", "wrench"]
-    else:  # With less noise, or for longer, the errors on validation wires rise.
-        head = _MAZE_DIFFUSION
-        learn += ["--touch-input", "embedding", "--touch-noise", "0.5"]
+    learn += ["--touch-input", "wrench" if config.wrench else "embedding"]
+    rounds = [*_REGRESSION, "--train.epochs", str(config.epochs or 5)]
+    last = rounds
+    if not config.wrench:
+        last = [*_MAZE_DIFFUSION, "--train.epochs", str(config.epochs or 3)]
     deployed, many = [*_MAZE, *_DEPLOYED], config.demonstrations or 160
     steps = _demonstrations(config, out, many, many, [*_VALIDATION, *_DEPLOYED], deployed)
     if config.learn_touch:
         options = shlex.split("--frames 45 --mae.bottleneck --mae.epochs 12 --out")
         steps.append(["train-encoder", "mae", *_data(out), *options, str(out / "touch")])
-    return steps + _corrected(config, out, learn, head, [deployed] * 3, config.corrections or 80)
+    return steps + _corrected(
+        config, out, learn, rounds, last, [deployed] * 3, config.corrections or 80
+    )
 
 
 def _demonstrations(
@@ -192,11 +195,15 @@ def _corrected(
     config: Config,
     out: Path,
     options: list[str],
-    head: list[str],
+    learn_rounds: list[str],
+    learn_last: list[str],
     envs: list[list[str]],
     episodes: int,
 ) -> list[list[str]]:
-    """Return rounds of training and correction (DAgger), and the last training, with `head`."""
+    """Return rounds of training and correction (DAgger), and the last training.
+
+    Options: `options` of every training, `learn_rounds` of the rounds', `learn_last` of the last.
+    """
     from touchgoal.runtime.errors import UserError
 
     rounds = len(envs) if config.rounds is None else config.rounds
@@ -206,11 +213,11 @@ def _corrected(
     steps = []
     for k, env in enumerate(envs[:rounds]):
         folder = out / f"round-{k + 1}"
-        steps.append([*learn, *_REGRESSION, "--trials", "0", "--out", str(folder)])
+        steps.append([*learn, *learn_rounds, "--trials", "0", "--out", str(folder)])
         seed = seeds.CORRECTIONS[k].first(episodes, "--corrections")
         acts = ["--policy", str(folder / "policy"), *env]
         steps.append(_record(out / "train", episodes, seed, acts, config))
-    final = [*learn, *head, "--trials", str(config.trials), "--env.as-deployed"]
+    final = [*learn, *learn_last, "--trials", str(config.trials), "--env.as-deployed"]
     return [*steps, [*final, "--out", str(out / "policy")]]
 
 

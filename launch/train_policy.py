@@ -74,7 +74,7 @@ class Config(TrainingOptions):
     """Train a touch ViT jointly with the policy, instead of a frozen encoder."""
     cameras: tuple[str, ...] = ()
     """Cameras that the policy sees by, such as front wrist: keypoints of a frozen image encoder's
-    feature maps, asked anew at every plan; default: none."""
+    feature maps, read at every plan; default: none."""
     estimator: Path | None = None
     """Folder of a state estimator (train-estimators). The policy is trained on the simulator's contacts
     and object poses, without images; when it acts, the estimator supplies both."""
@@ -229,7 +229,8 @@ def _image_input(config: Config, episodes: "EpisodeSet") -> "ImageInputConfig | 
     if not config.cameras:
         return None
     keys = tuple(ft.IMAGE_PREFIX + name.removeprefix(ft.IMAGE_PREFIX) for name in config.cameras)
-    there = [key for key in episodes.features if key.startswith(ft.IMAGE_PREFIX)]
+    images = [key for key in episodes.features if key.startswith(ft.IMAGE_PREFIX)]
+    there = [key for key in images if key not in ft.TACTILE]
     if missing := set(keys) - set(there):
         raise UserError(
             f"{episodes.root} has no {sorted(missing)[0]}; its cameras: {', '.join(there) or 'none'}"

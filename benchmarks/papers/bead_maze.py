@@ -259,7 +259,7 @@ def _with_shuffled_touch(policy: PolicyNetwork, recorded_touch: torch.Tensor) ->
     def shuffled(batch: ObservationBatch) -> torch.Tensor:
         rows = torch.arange(len(batch.touch)) % len(recorded_touch)
         touch = recorded_touch[rows].float()[:, None].expand_as(batch.touch)
-        return plan(ObservationBatch(touch, batch.state, batch.pictures))
+        return plan(replace(batch, touch=touch))
 
     return shuffled
 

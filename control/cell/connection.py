@@ -164,7 +164,7 @@ def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellC
 def connect_arm(cell: CellConfig, hz: float, recover: bool = False) -> ArmProcess:
     """Connect to a cell's arm alone; `recover` clears a fault first: only when a person asked for it.
 
-    DriverError if the arm is missing or lets nobody connect.
+    DriverError if the arm is missing or refuses the connection.
     """
     ur5e = cell.arm == "ur5e"
     rate, timeout = (ur.RATE, ur.STATE_TIMEOUT) if ur5e else (franka.RATE, franka.STATE_TIMEOUT)

@@ -43,7 +43,7 @@ from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig
 
 TRUE_KINDS = tuple(kind for kind in KINDS if kind != "overgripped")
-"""Kinds whose mean is judged. 40 N cannot be told where the demonstrations differ in force; the part
+"""Kinds whose mean is judged. 40 N cannot be recognised where the demonstrations differ in force; the part
 "force" has a line of its own."""
 _ON_DIAGONAL = 8  # objects
 _AUDITED = ("success", "drop", "wrong_object")
