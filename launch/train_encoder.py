@@ -169,6 +169,10 @@ Config = (
 
 def main(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Words | Adapt) -> None:
     """Train one kind of encoder."""
+    from touchgoal.encoders.training.run import check_one_process
+
+    if isinstance(config, Surfaces | Words | Adapt):
+        check_one_process(type(config).__name__.lower())
     match config:
         case Align():
             from touchgoal.launch.support.align_touch import align_touch

@@ -78,20 +78,36 @@ def test_the_start_is_seen_from_the_hand() -> None:
         np.testing.assert_allclose(observed, expected, atol=1e-6)
 
 
-def test_contact_is_learnt(tmp_path: Path) -> None:
-    touch = torch.randn(4000, 6, generator=torch_rng())
-    contact = torch.stack([touch[:, 0] > 0, touch[:, 3] > 0], 1)  # one number of each fingertip
+def train_contact(count: int, epochs: int, out: Path) -> float:
+    """Train the contact head on embeddings with one number of each fingertip; return its accuracy."""
+    touch = torch.randn(count, 6, generator=torch_rng())
+    contact = torch.stack([touch[:, 0] > 0, touch[:, 3] > 0], 1)
     network = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL))
-    train_contact_estimator(
-        network,
-        touch,
-        contact,
-        EstimatorTrainConfig(contact_epochs=100, touch_noise=0.1),
-        tmp_path,
-        TrainerOptions(),
-        {},
-    )
-    assert ((network.contact(touch) > 0) == contact).float().mean() > 0.9
+    config = EstimatorTrainConfig(contact_epochs=epochs, touch_noise=0.1)
+    train_contact_estimator(network, touch, contact, config, out, TrainerOptions(), {})
+    return float(((network.contact(touch) > 0) == contact).float().mean())
+
+
+def train_pose(count: int, epochs: int, out: Path) -> float:
+    """Train the pose estimator on bright spots on grey; return the median error, mm."""
+    spots = torch.randint(0, 14, (count, 2), generator=torch_rng())
+    pictures = torch.full((count, 16, 16, 3), 128, dtype=torch.uint8)
+    for picture, (row, column) in zip(pictures, spots, strict=True):
+        picture[row : row + 2, column : column + 2] = 255
+    start = torch.zeros(count, 7)
+    start[:, 3] = 1.0
+    start[:, :2] = spots / 100
+    tcp = torch.randn(count, 7, generator=torch_rng())
+    placements = Placements({ft.FRONT: pictures}, tcp, start)
+    sight = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL)).pose_estimator
+    config = EstimatorTrainConfig(epochs=epochs, lr=1e-2)
+    train_pose_estimator(sight, placements, config, out, TrainerOptions(), {})
+    return pose_errors(sight, placements)["object_mm"][0]
+
+
+def test_contact_is_learnt(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    assert train_contact(4000, 100, tmp_path) > 0.9
 
 
 def test_contact_is_true_or_false() -> None:
@@ -102,20 +118,8 @@ def test_contact_is_true_or_false() -> None:
 
 
 def test_a_place_is_learnt(tmp_path: Path) -> None:
-    """A bright spot on grey, where it is to be found again."""
     torch.manual_seed(0)
-    spots = torch.randint(0, 14, (256, 2), generator=torch_rng())
-    pictures = torch.full((256, 16, 16, 3), 128, dtype=torch.uint8)
-    for picture, (row, column) in zip(pictures, spots, strict=True):
-        picture[row : row + 2, column : column + 2] = 255
-    start = torch.zeros(256, 7)
-    start[:, 3] = 1.0
-    start[:, :2] = spots / 100
-    placements = Placements({ft.FRONT: pictures}, torch.randn(256, 7, generator=torch_rng()), start)
-    sight = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL)).pose_estimator
-    config = EstimatorTrainConfig(epochs=75, lr=1e-2)
-    train_pose_estimator(sight, placements, config, tmp_path, TrainerOptions(), {})
-    assert pose_errors(sight, placements)["object_mm"][0] < 15  # 60 by chance
+    assert train_pose(256, 75, tmp_path) < 15  # 60 by chance
 
 
 def test_estimators_survive_the_disk(tmp_path: Path) -> None:

@@ -18,7 +18,8 @@ from touchgoal.runtime.run_folder import open_run
 def check_training(options: TrainerOptions, out: Path | None, first: str = "") -> None:
     """Check what can be checked before data are read, and take the keys of the sets.
 
-    `first` is the first training's subfolder. UserError: no such device, keys of another form, an unfit folder, or no folder where one is needed.
+    `first` is the first training's subfolder. UserError: no such device, keys of another form, an unfit
+    folder, or no folder where one is needed.
     """
     check_device(options.device)
     use_keys(options.keys)
@@ -28,6 +29,12 @@ def check_training(options: TrainerOptions, out: Path | None, first: str = "") -
         raise UserError("several processes need one folder: name it with --out")
     if out is not None:
         check_run_folder(out / first, options.resume)
+
+
+def check_one_process(method: str) -> None:
+    """Raise UserError under torchrun: a fit in closed form has no batches to share."""
+    if int(os.environ.get("WORLD_SIZE", 1)) > 1:
+        raise UserError(f"train-encoder {method} runs in one process: start it without torchrun")
 
 
 def open_training(config: Any, command: str) -> Path:
