@@ -83,7 +83,8 @@ class Config(TrainingOptions):
     share: Annotated[Fraction, RARE] = 1.0
     """Share of the episodes to train on, counted from the first."""
     head: Head = "small"
-    """Size of the U-Net of a diffusion policy, or regression, which predicts plans directly."""
+    """Denoiser of a diffusion policy: a U-Net (tiny, small, published) or an mlp, which learns in a
+    fifth of the time; or regression, which predicts plans directly."""
     representation: ActionRepresentation = "body_twist"
     """Actions as the network predicts them: delta (joint change of each control tick), relative
     (joint change since the plan's start), absolute (joint positions), base_twist or body_twist
@@ -192,16 +193,18 @@ def _policy_config(
     config: Config, episodes: "EpisodeSet", touch: "TouchEmbedder | None"
 ) -> "PolicyConfig":
     from touchgoal.control import features as ft
-    from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
+    from touchgoal.policies.heads.diffusion import DiffusionConfig
+    from touchgoal.policies.heads.mlp import MLPConfig
     from touchgoal.policies.heads.unet import PRESETS
     from touchgoal.policies.network import PolicyConfig
     from touchgoal.policies.perception.end_to_end import EndToEndConfig
     from touchgoal.policies.perception.state_estimation import ESTIMATED
 
     columns = ft.STATE, ft.TCP_POSE, *[ft.COMMAND] * (config.arm_state == "commanded")
-    head = RegressionConfig()
+    head = MLPConfig()
     if config.head != "regression":
-        head = DiffusionConfig(PRESETS[config.head], config.sampler)
+        denoiser = MLPConfig() if config.head == "mlp" else PRESETS[config.head]
+        head = DiffusionConfig(denoiser, config.sampler)
     return PolicyConfig(
         touch_dim=touch.dim if touch else 0,
         touch=touch.name if touch else "",

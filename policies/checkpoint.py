@@ -11,7 +11,8 @@ import torch
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.acting import LearnedPolicy, Task
 from touchgoal.policies.config import SamplerConfig
-from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.heads.diffusion import DiffusionConfig
+from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.network import PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
@@ -143,11 +144,11 @@ def suggestion(name: str, names: tuple[str, ...] = (*SHIPPED_POLICIES, *FURTHER_
 
 def _config(fields: dict[str, Any]) -> PolicyConfig:
     head = fields["head"]
-    if "unet" in head:
-        unet = head["unet"] | {"channels": tuple(head["unet"]["channels"])}
-        fields["head"] = DiffusionConfig(UNetConfig(**unet), SamplerConfig(**head["sampler"]))
+    if "denoiser" in head:
+        denoiser = _denoiser(head["denoiser"])
+        fields["head"] = DiffusionConfig(denoiser, SamplerConfig(**head["sampler"]))
     else:
-        fields["head"] = RegressionConfig(**head)
+        fields["head"] = MLPConfig(**head)
     if end_to_end := fields["end_to_end"]:
         fields["end_to_end"] = EndToEndConfig(**end_to_end | {"size": tuple(end_to_end["size"])})
     if images := fields.get("images"):
@@ -156,3 +157,9 @@ def _config(fields: dict[str, Any]) -> PolicyConfig:
     for key in ("proprioception", "gripper_widths"):
         fields[key] = tuple(fields[key])
     return PolicyConfig(**fields)
+
+
+def _denoiser(fields: dict[str, Any]) -> UNetConfig | MLPConfig:
+    if "channels" in fields:
+        return UNetConfig(**fields | {"channels": tuple(fields["channels"])})
+    return MLPConfig(**fields)

@@ -16,8 +16,9 @@ from touchgoal.runtime.option_types import (
     checked_dataclass,
 )
 
-Head = Literal["small", "published", "tiny", "regression"]
-"""A diffusion head with a U-Net of that size, or one that predicts a plan directly."""
+Head = Literal["small", "published", "tiny", "mlp", "regression"]
+"""A diffusion head with a U-Net of that size or a multilayer perceptron, or one that predicts a plan
+directly."""
 ArmState = Literal["measured", "commanded"]
 TouchInput = Literal["wrench", "embedding"]
 ActionRepresentation = Literal["delta", "relative", "absolute", "base_twist", "body_twist"]

@@ -21,8 +21,9 @@ from touchgoal.policies.heads.diffusion import (
     Diffusion,
     DiffusionConfig,
     Regression,
-    RegressionConfig,
 )
+from touchgoal.policies.heads.mlp import MLPConfig
+from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
 from touchgoal.policies.perception.frozen_images import ImageInputConfig, ImageReadout
 from touchgoal.policies.perception.proprioception import input_widths, is_position, network_input
@@ -65,8 +66,8 @@ class PolicyConfig:
     # middle share of the training's actions that the head's range of -1 to 1 covers
     action_share: float = 1.0
     control_hz: int = ft.CONTROL_HZ  # ticks per second
-    # predicts the plan
-    head: DiffusionConfig | RegressionConfig = field(default_factory=DiffusionConfig)
+    # predicts the plan; an MLPConfig is that of a regression
+    head: DiffusionConfig | MLPConfig = field(default_factory=DiffusionConfig)
     task: str = ""  # of the training episodes, such as "bead-maze"; "" if unknown
     sensor: str = ""  # of the fingertips in them; "" without touch
 
@@ -85,8 +86,8 @@ class PolicyConfig:
                 f"execution_horizon {self.execution_horizon} must be between 1 and the "
                 f"prediction_horizon {self.prediction_horizon}"
             )
-        if isinstance(self.head, DiffusionConfig):
-            factor = self.head.unet.tick_multiple
+        if isinstance(self.head, DiffusionConfig) and isinstance(self.head.denoiser, UNetConfig):
+            factor = self.head.denoiser.tick_multiple
             if self.prediction_horizon % factor:
                 raise UserError(
                     f"prediction_horizon {self.prediction_horizon} must be a multiple of {factor} "

@@ -9,15 +9,16 @@ from torch import Tensor, nn
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.trainer import gather_batch
 from touchgoal.policies.config import SamplerConfig
+from touchgoal.policies.heads.mlp import MLPConfig, MLPDenoiser, build_mlp
 from touchgoal.policies.heads.samplers import add_noise, denoise
 from touchgoal.policies.heads.unet import PRESETS, UNet, UNetConfig
 
 
 @dataclass(frozen=True)
 class DiffusionConfig:
-    """U-Net and sampler of a diffusion head."""
+    """Network and sampler of a diffusion head."""
 
-    unet: UNetConfig = field(default_factory=lambda: PRESETS["small"])
+    denoiser: UNetConfig | MLPConfig = field(default_factory=lambda: PRESETS["small"])
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
 
 
@@ -28,7 +29,10 @@ class Diffusion(nn.Module):
         super().__init__()
         self.config = config
         self._shape = ticks, action_dim
-        self.network = UNet(config.unet, action_dim, condition_dim)
+        if isinstance(config.denoiser, MLPConfig):
+            self.network = MLPDenoiser(config.denoiser, ticks, action_dim, condition_dim)
+        else:
+            self.network = UNet(config.denoiser, action_dim, condition_dim)
 
     def loss(
         self,
@@ -53,14 +57,6 @@ class Diffusion(nn.Module):
         )
 
 
-@dataclass(frozen=True)
-class RegressionConfig:
-    """Width and number of the hidden layers of a multilayer perceptron."""
-
-    width: int = 512
-    depth: int = 3
-
-
 class Regression(nn.Module):
     """Prediction of the median of the demonstrations, by the absolute error as in ACT (Zhao et al.
     2023).
@@ -69,15 +65,10 @@ class Regression(nn.Module):
     modes.
     """
 
-    def __init__(self, config: RegressionConfig, ticks: int, action_dim: int, condition_dim: int):
+    def __init__(self, config: MLPConfig, ticks: int, action_dim: int, condition_dim: int):
         super().__init__()
         self._shape = ticks, action_dim
-        layers: list[nn.Module] = []
-        width = condition_dim
-        for _ in range(config.depth):
-            layers += [nn.Linear(width, config.width), nn.LayerNorm(config.width), nn.Mish()]
-            width = config.width
-        self.network = nn.Sequential(*layers, nn.Linear(width, ticks * action_dim))
+        self.network = build_mlp(config, condition_dim, ticks * action_dim)
 
     def loss(
         self,
