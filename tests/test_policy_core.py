@@ -30,7 +30,8 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint
 from touchgoal.policies.actions import Normalizer, to_actions, to_representation
 from touchgoal.policies.config import ActionRepresentation, TrainConfig
-from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.heads.diffusion import DiffusionConfig
+from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.training import train as train_module
@@ -108,7 +109,7 @@ def test_windows_stay_inside_their_episode() -> None:
     torch.testing.assert_close(windows.actions[3], actions[2])
 
 
-@pytest.mark.parametrize("head", [DIFFUSION, FLOW, RegressionConfig(64, 2)])
+@pytest.mark.parametrize("head", [DIFFUSION, FLOW, MLPConfig(64, 2)])
 def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     """Padding reaches neither the loss nor the normalizer."""
     config = replace(TOY, head=head)
@@ -124,7 +125,7 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     for chunk in (actions, other):
         loss = policy.loss(batch, chunk, BatchNoise(torch_rng()), wrench, is_pad)
         losses.append(torch.autograd.grad(loss, list(policy.head.parameters())))
-    if isinstance(head, RegressionConfig):  # a U-Net sees the padding, noised, beside the rest
+    if isinstance(head, MLPConfig):  # a U-Net sees the padding, noised, beside the rest
         for one, two in zip(*losses, strict=True):
             torch.testing.assert_close(one, two)
     everything = policy.head.loss(torch.zeros(2, 8, 8), torch.zeros(2, policy.condition_dim),
@@ -142,9 +143,10 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     [
         TOY,
         replace(TOY, head=FLOW, representation="absolute"),
-        replace(TOY, head=RegressionConfig(64, 2), representation="delta", touch_input="embedding"),
+        replace(TOY, head=DiffusionConfig(MLPConfig(64, 2))),
+        replace(TOY, head=MLPConfig(64, 2), representation="delta", touch_input="embedding"),
     ],
-    ids=["ddim-relative", "flow-absolute", "regression-delta"],
+    ids=["ddim-relative", "flow-absolute", "mlp-relative", "regression-delta"],
 )
 def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
     windows = toy_dataset(config, (6, 6))
@@ -208,10 +210,8 @@ def test_a_killed_training_ends_as_an_uninterrupted_one(
     assert math.isfinite(provenance["metrics"]["validation_error"])
 
 
-@pytest.mark.parametrize("head", [DIFFUSION, RegressionConfig(32, 1)])
-def test_a_saved_policy_plans_the_same(
-    tmp_path: Path, head: DiffusionConfig | RegressionConfig
-) -> None:
+@pytest.mark.parametrize("head", [DIFFUSION, DiffusionConfig(MLPConfig(32, 1)), MLPConfig(32, 1)])
+def test_a_saved_policy_plans_the_same(tmp_path: Path, head: DiffusionConfig | MLPConfig) -> None:
     config = replace(TOY, head=head, representation="absolute")
     windows = toy_dataset(config)
     policy = toy_policy(config, windows)
@@ -225,7 +225,7 @@ def test_a_saved_policy_plans_the_same(
 
 
 def test_a_hand_that_only_opens_and_closes_is_sent_nothing_in_between(tmp_path: Path) -> None:
-    config = replace(TOY, head=RegressionConfig(32, 1))
+    config = replace(TOY, head=MLPConfig(32, 1))
     recorded = toy_dataset(config).recorded
     actions = recorded.actions.clone()
     actions[:, 7] = 0.08 * (torch.arange(len(actions)) % 2)
