@@ -161,5 +161,6 @@ def _config(fields: dict[str, Any]) -> PolicyConfig:
 
 def _denoiser(fields: dict[str, Any]) -> UNetConfig | MLPConfig:
     if "channels" in fields:
-        return UNetConfig(**fields | {"channels": tuple(fields["channels"])})
+        channels = {"channels": tuple(fields["channels"])}
+        return UNetConfig(**fields | channels)
     return MLPConfig(**fields)

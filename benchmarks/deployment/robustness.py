@@ -68,12 +68,18 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _environments(config: Config, task: TaskName) -> dict[str, TaskConfig]:
-    base = replace(ENVS[task], as_deployed=config.as_deployed)
-    if isinstance(base, BeadMazeConfig):
-        base = replace(base, split="test", start_angle=10.0)
+    base = deployed_task(task, config.as_deployed)
     late = {
         name: replace(base, deployment=replace(base.deployment, **change))
         for name, change in (_DELAYED | _FROZEN).items()
     }
     changed = {name: replace(base, **change) for name, change in _CHANGES[task].items()}
     return {UNCHANGED: base, **changed, **late}
+
+
+def deployed_task(task: TaskName, as_deployed: bool) -> TaskConfig:
+    """Return a task's options for tests: the maze's test wires, the hand up to 10 degrees askew."""
+    base = replace(ENVS[task], as_deployed=as_deployed)
+    if isinstance(base, BeadMazeConfig):
+        return replace(base, split="test", start_angle=10.0)
+    return base

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
-from touchgoal.policies.evaluation.evaluate import evaluate
+from touchgoal.policies.evaluation.evaluate import Evaluation, evaluate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import TaskConfig
+
+TABLE_HEAD = f"{'':<46}{'success [95 % Wilson]':<24}{'peak force N, mean':>19}{'sd':>6}{'max':>6}"
 
 
 @checked_dataclass
@@ -30,15 +32,19 @@ class TrialOptions(BenchmarkOptions):
 
 def try_cases(config: TrialOptions, cases: Iterable[tuple[str, TaskConfig]]) -> dict[str, Any]:
     """Return the table and the trials of a policy in each named environment."""
-    lines = [f"{'':<46}{'success [95 % Wilson]':<24}{'peak force N, mean':>19}{'sd':>6}{'max':>6}"]
-    rows = []
+    lines, rows = [TABLE_HEAD], []
     for what, task in cases:
         result = evaluate(
             config.policy, task, episodes=config.episodes, seed=config.seed, workers=config.workers
         )
-        peak = [trial.peak_force for trial in result.trials]
-        force = f"{np.mean(peak):>19.1f}{np.std(peak):>6.1f}{max(peak):>6.1f}"
-        lines.append(f"{what:<46}{result!s:<24}{force}")
+        lines.append(table_row(what, result))
         print(lines[-1], file=sys.stderr, flush=True)
         rows.append({"what": what, "trials": [asdict(trial) for trial in result.trials]})
     return {"table": "\n".join(lines), "rows": rows}
+
+
+def table_row(what: str, result: Evaluation) -> str:
+    """Return a line of the table under `TABLE_HEAD`."""
+    peak = [trial.peak_force for trial in result.trials]
+    force = f"{np.mean(peak):>19.1f}{np.std(peak):>6.1f}{max(peak):>6.1f}"
+    return f"{what:<46}{result!s:<24}{force}"

@@ -1,0 +1,104 @@
+"""Inputs that a policy's success depends on: each one replaced by another episode's, tick by tick.
+
+A policy that does as well without its touch does not feel. The other episode is a run of the same
+policy on the next wire or in the next scene; where it is shorter, its last tick stays.
+"""
+
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from touchgoal.benchmarks.deployment.robustness import deployed_task
+from touchgoal.benchmarks.deployment.trials import TABLE_HEAD, TrialOptions, table_row
+from touchgoal.control import features as ft
+from touchgoal.control.features import Observation
+from touchgoal.episodes.recording import Actor, EpisodeSpec
+from touchgoal.policies.by_name import PolicyMaker, prepare_policy
+from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trial, trial_specs
+from touchgoal.runtime.option_types import checked_dataclass
+from touchgoal.runtime.progress import track
+from touchgoal.runtime.worker_pool import one_core_workers
+from touchgoal.sim_envs.config import ENVS, TaskConfig, TaskName
+
+UNCHANGED = "as it is"
+
+
+@checked_dataclass
+class Config(TrialOptions):
+    """Options of benchmark audit."""
+
+    tasks: tuple[TaskName, ...] = tuple(ENVS)
+    """Tasks; the maze is on test wires."""
+    as_deployed: bool = True
+    """Let the arm behave as deployed."""
+
+
+@dataclass
+class _Watched:
+    """A policy that keeps what it observed."""
+
+    policy: Actor
+    seen: list[Observation] = field(default_factory=list)
+
+    def act(self, observation: Observation) -> np.ndarray:
+        self.seen.append(observation)
+        return self.policy.act(observation)
+
+
+@dataclass
+class _Replaced:
+    """A policy that gets some columns from another episode."""
+
+    policy: Actor
+    keys: tuple[str, ...]
+    other: list[Observation]
+    tick: int = -1
+
+    def act(self, observation: Observation) -> np.ndarray:
+        self.tick = min(self.tick + 1, len(self.other) - 1)
+        return self.policy.act(observation | {k: self.other[self.tick][k] for k in self.keys})
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Return success by task and replaced input, with the trials."""
+    lines, rows = [TABLE_HEAD], []
+    for task in config.tasks:
+        maker, env = prepare_policy(config.policy, deployed_task(task, config.as_deployed))
+        specs = trial_specs(env, config.episodes + 1, config.seed)
+        audit = partial(_audit, env, maker)
+        with one_core_workers(min(config.workers, config.episodes)) as pool:
+            found = pool.map(audit, specs[:-1], specs[1:])
+            trials = list(track(found, f"{task}: audit", "episode", total=config.episodes))
+        for name in trials[0]:
+            of_name = tuple(trial[name] for trial in trials)
+            lines.append(table_row(f"{task}, {name}", Evaluation(of_name)))
+            rows.append({"what": f"{task}, {name}", "trials": [asdict(t) for t in of_name]})
+    return {"table": "\n".join(lines), "rows": rows}
+
+
+def _inputs(env: TaskConfig) -> dict[str, tuple[str, ...]]:
+    """Return the inputs that a policy may read in an environment: name -> columns."""
+    cameras = {name: (ft.IMAGE_PREFIX + name,) for name in env.cameras}
+    touch = {"touch": tuple(ft.TACTILE)} if env.tactile else {}
+    state = {"arm's state": (ft.STATE, ft.TCP_POSE, ft.COMMAND), "wrench": (ft.WRENCH,)}
+    return touch | cameras | state
+
+
+def _audit(
+    env: TaskConfig, maker: PolicyMaker, spec: EpisodeSpec, other: EpisodeSpec
+) -> dict[str, Trial]:
+    """Run one episode as it is, and with each input of another one in turn."""
+    watched: list[_Watched] = []
+
+    def watch(made_for: Any) -> Actor:
+        watched.append(_Watched(maker(made_for)))
+        return watched[-1]
+
+    trials = {UNCHANGED: run_trial(env, watch, other)}
+    for name, keys in _inputs(env).items():
+        trials[f"{name} of another episode"] = run_trial(
+            env, lambda made_for, k=keys: _Replaced(maker(made_for), k, watched[0].seen), spec
+        )
+    return trials
