@@ -161,6 +161,5 @@ def _config(fields: dict[str, Any]) -> PolicyConfig:
 
 def _denoiser(fields: dict[str, Any]) -> UNetConfig | MLPConfig:
     if "channels" in fields:
-        channels = {"channels": tuple(fields["channels"])}
-        return UNetConfig(**fields | channels)
+        return UNetConfig(**{**fields, "channels": tuple(fields["channels"])})
     return MLPConfig(**fields)
