@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 import touchgoal
+from touchgoal.policies.config import POLICIES
 from touchgoal.runtime.option_types import checked_dataclass
 
 _WEIGHTS = Path(touchgoal.__file__).parent / "encoders" / "weights"
@@ -16,10 +17,7 @@ TASKS = {
     "pick-place": "pick an object up and place it on a disc",
     "bead-maze": "lead a bead along a bent wire by touch",
 }
-POLICIES = {
-    "expert": "the task's scripted expert, which reads the simulator's state",
-    "follower": "bead-maze: a classical controller on the force at the hand",
-    "shipped": "the learned policy that ships for the task",
+OWN_POLICIES = {
     "FOLDER": "a policy that train-policy made: its folder policy/",
     "MODULE:CLASS": "a class of your own with reset() and act(observation); or FILE.py:CLASS",
 }
@@ -81,7 +79,7 @@ KINDS: dict[Kind, tuple[Callable[[], dict[str, str]], str]] = {
     "objects": (_objects, "--env.objects NAME"),
     "sensors": (_sensors, "--env.sensor NAME"),
     "tasks": (lambda: TASKS, "--task NAME"),
-    "policies": (lambda: POLICIES, "--policy NAME"),
+    "policies": (lambda: POLICIES | OWN_POLICIES, "--policy NAME"),
     "encoders": (_encoders, "--encoder NAME"),
     "benchmarks": (_benchmarks, "touchgoal benchmark NAME"),
 }

@@ -15,19 +15,11 @@ from touchgoal.control.deployment.user_policy import Policy, UserPolicy, find_us
 from touchgoal.episodes.recording import Actor
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy, suggestion
+from touchgoal.policies.config import POLICIES
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import make_expert, task_name
-
-BUILT_IN = {
-    "expert": "the task's expert, which sees the simulator's state",
-    "follower": "bead-maze: classical control from the force on the hand",
-    "shipped": "the policy that ships for the task",
-    **{name: f"the policy that ships for {name}" for name in SHIPPED_POLICIES},
-    "bead-maze-diffusion": "the maze by diffusion on the frozen touch embedding",
-}
-"""Names of policies, and what they are."""
 
 PolicyMaker = Callable[[Any], Actor]
 """Makes the policy for one episode of an environment, after its reset; it must pickle."""
@@ -98,7 +90,7 @@ def choose_policy(policy: AnyPolicy, task: TaskConfig) -> PolicyMaker:
                 f"no policy in {name}: train one with touchgoal train-policy"
             ) from error
         raise UserError(
-            f"there is no policy {name!r}: {suggestion(name, tuple(BUILT_IN))}, or a class of your "
+            f"there is no policy {name!r}: {suggestion(name, tuple(POLICIES))}, or a class of your "
             "own as module:Class or file.py:Class"
         ) from error
 

@@ -27,6 +27,15 @@ The hand's displacement and rotation (m, rad) are to first order. "base_twist" a
 joint's change for the elbow, and hardly depends on the hand's place on the table; with "body_twist"
 the elbow goes where the joints move least. The gripper's width is a target in all of them."""
 Box = tuple[int, int, int, int]
+POLICIES = {
+    "expert": "the task's scripted expert, which reads the simulator's state",
+    "follower": "bead-maze: a classical controller on the force at the hand",
+    "shipped": "the learned policy that ships for the task",
+    "pick-place": "the learned policy that ships for pick-place",
+    "bead-maze": "the learned policy that ships for bead-maze",
+    "bead-maze-diffusion": "bead-maze: diffusion on the frozen touch embedding",
+}
+"""Names of policies, and what they are."""
 
 
 @checked_dataclass
@@ -120,7 +129,7 @@ class EstimatorTrainConfig:
     pixel_noise: CountOrNone = 4
     """Largest change of a pixel by simulated camera noise, grey levels of 255."""
     contact_epochs: Count = 4
-    """Passes over the control ticks, for contact: 256 ticks a step, at a learning rate of 1e-3."""
+    """Passes over the control ticks, for contact: 256 ticks per step, at a learning rate of 1e-3."""
     touch_noise: NotNegative = 0.5
     """Noise on touch embeddings in training, relative to their standard deviation, so that contact
     is recognised with other sensors of the same model."""
