@@ -126,6 +126,16 @@ def load_encoder(name_or_path: str | Path, sensor: str | None = None) -> AnyTouc
     return encoder
 
 
+def load_pooled_encoder(name_or_path: str | Path) -> PooledEncoder:
+    """Load an encoder of `train-encoder surfaces`; UserError for any other."""
+    encoder = load_encoder(name_or_path)
+    if not isinstance(encoder, PooledEncoder):
+        raise UserError(
+            f"{name_or_path} was not trained by `train-encoder surfaces`: give one that was"
+        )
+    return encoder
+
+
 def _build_config(
     fields: dict[str, Any],
 ) -> TouchEncoderConfig | TouchBackboneConfig | PooledEncoderConfig:

@@ -26,9 +26,9 @@ _DEPLOYED = shlex.split(  # delays wider than measured on the wire: see `Deploym
 # The policy is trained on the simulator's truth, so these episodes need no images.
 _NO_IMAGES = ["--env.no-tactile", "--env.cameras"]
 _REGRESSION = ["--head", "regression"]
-# One step of five noise levels: fresh noise at every plan, and each further step, makes successive
-# plans disagree. On 40 validation wires a U-Net in place of the perceptron led 33 beads to the end, this
-# 37 and, from another seed, 39. Trained for longer, the error on validation wires rises.
+# Denoising steps: one of five. Further steps, and fresh noise at every plan, make successive plans
+# disagree. On 40 validation wires a U-Net led 33 beads to the end, this perceptron 37 and, from another
+# seed, 39. With longer training, the errors on validation wires rise.
 _MAZE_DIFFUSION = shlex.split(
     "--head mlp --touch-noise 0.5 --sampler.loss absolute --sampler.num-train-timesteps 5 "
     "--sampler.num-inference-steps 1 --action-share 0.98"
@@ -158,7 +158,7 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     The policies of the rounds are regressions; the recorded corrections are the expert's all the same.
     """
     touch = out / "touch" if config.learn_touch else config.touch
-    learn = shlex.split(  # Observing two ticks it led the bead less often on validation wires.
+    learn = shlex.split(  # with two observed ticks the bead arrived less often on validation wires
         "--representation body_twist --arm-state commanded --train.lr 1e-3 --env.start-angle 10 "
         "--task bead-maze --observation-horizon 4 --train.snapshot-epochs 5"
     )

@@ -113,11 +113,11 @@ class Surfaces:
 
 @checked_dataclass
 class Words:
-    """Add words and pictures to an encoder of `surfaces`: maps to its embeddings, which do not change."""
+    """Add maps of sentences and images to an encoder of `surfaces`, whose embeddings stay as they are."""
 
     data: Annotated[tuple[Path, ...], Field(min_length=1)]
-    """Sets of touched objects on which there are sentences: of `collect-touches --body wand`, whose
-    views teach pictures (at least one), and of `collect-demos`, in which objects are grasped."""
+    """Sets of touched objects with sentences: at least one of `collect-touches --body wand`, whose views
+    teach the images, and grasps of `collect-demos`."""
     encoder: str = "gelsight_mini"
     """Encoder to add to: a name, or its folder."""
     towers: str = "offline"
@@ -237,18 +237,18 @@ def _add_words(config: Words) -> None:
     from touchgoal.encoders.alignment.heads import fit_heads
     from touchgoal.encoders.alignment.wand_set import WandSet, is_wand_set
     from touchgoal.encoders.alignment.words import embed_surfaces, embed_wand, with_heads
-    from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
-    from touchgoal.encoders.pretrained import ENCODER_FORMAT, find_encoder, load_encoder, save
+    from touchgoal.encoders.pretrained import (
+        ENCODER_FORMAT,
+        find_encoder,
+        load_pooled_encoder,
+        save,
+    )
     from touchgoal.encoders.towers.towers import load_towers
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run
 
-    encoder = load_encoder(config.encoder)
-    if not isinstance(encoder, PooledEncoder):
-        raise UserError(
-            f"{config.encoder} was not trained by `train-encoder surfaces`: add words to one that was"
-        )
+    encoder = load_pooled_encoder(config.encoder)
     of_wand = [root for root in config.data if is_wand_set(root)]
     if not of_wand:
         raise UserError("no set has views: record one with collect-touches --body wand")
@@ -282,20 +282,14 @@ def _add_words(config: Words) -> None:
 
 def _adapt(config: Adapt) -> None:
     """Blend the within-object covariance of real videos into a fitted encoder."""
-    from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
-    from touchgoal.encoders.pretrained import load_encoder, save
+    from touchgoal.encoders.pretrained import load_pooled_encoder, save
     from touchgoal.encoders.towers.towers import load_towers
     from touchgoal.encoders.whitening.adapt import adapt
     from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
-    from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run
 
-    encoder = load_encoder(config.encoder)
-    if not isinstance(encoder, PooledEncoder):
-        raise UserError(
-            f"{config.encoder} was not trained by `train-encoder surfaces`: adapt one that was"
-        )
+    encoder = load_pooled_encoder(config.encoder)
     every = read_labelled_videos(config.data)
     videos = [video for video in every if video.split in ("train", "unlabelled")]
     towers = load_towers(config.towers)

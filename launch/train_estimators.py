@@ -55,10 +55,10 @@ def main(config: Config) -> None:
     from touchgoal.policies.perception.frozen_touch import load_touch
     from touchgoal.policies.perception.placements import render_placements
     from touchgoal.policies.perception.state_estimation import (
+        ESTIMATOR_FORMAT,
         StateEstimatorConfig,
         StateEstimatorNetwork,
         load_network,
-        save_estimator,
     )
     from touchgoal.policies.training.model_selection import copy_parts
     from touchgoal.runtime import seeds
@@ -101,7 +101,8 @@ def main(config: Config) -> None:
     few = max(1, config.objects // 8)
     others = render_placements(env, few, 5, seeds.POSE_VALIDATION.start, config.workers)
     errors |= training.pose_errors(network.pose_estimator, others)
-    save_estimator(network, out / "estimator", provenance | {"errors": errors})
+    found = provenance | {"errors": errors}
+    ESTIMATOR_FORMAT.save_half(network, out / "estimator", network.config, found)
     if encoder.resolve() != pretrained.DEFAULT_ENCODER.resolve():
         copy_parts(out / "estimator", {"touch": encoder})
     write_json(out / "metrics.json", errors)

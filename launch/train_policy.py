@@ -73,7 +73,7 @@ class Config(TrainingOptions):
     end_to_end: bool = False
     """Train a touch ViT jointly with the policy, instead of a frozen encoder."""
     cameras: tuple[str, ...] = ()
-    """Cameras that the policy sees by, such as front wrist: keypoints of a frozen image encoder's
+    """Cameras that the policy reads, such as front wrist: keypoints of a frozen image encoder's
     feature maps, read at every plan; default: none."""
     estimator: Path | None = None
     """Folder of a state estimator (train-estimators). The policy is trained on the simulator's contacts

@@ -1,6 +1,6 @@
 """Policies on disk."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
@@ -42,10 +42,7 @@ def save(policy: PolicyNetwork, directory: Path, provenance: dict[str, Any]) -> 
         directory: made if needed.
         provenance: JSON-able: data, command, seed, metrics of the training.
     """
-    weights = {name: tensor.detach().cpu() for name, tensor in policy.state_dict().items()}
-    for name, _ in policy.named_parameters():
-        weights[name] = weights[name].half()
-    POLICY_FORMAT.save(directory, weights, asdict(policy.config), provenance)
+    POLICY_FORMAT.save_half(policy, directory, policy.config, provenance)
 
 
 def load(directory: Path) -> PolicyNetwork:

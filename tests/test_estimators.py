@@ -26,11 +26,11 @@ from touchgoal.policies.perception.placements import Placements
 from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.perception.state_estimation import (
     ESTIMATED,
+    ESTIMATOR_FORMAT,
     StateEstimator,
     StateEstimatorConfig,
     StateEstimatorNetwork,
     load_estimator,
-    save_estimator,
 )
 from touchgoal.policies.perception.training import (
     pose_errors,
@@ -124,7 +124,7 @@ def test_a_place_is_learnt(tmp_path: Path) -> None:
 
 def test_estimators_survive_the_disk(tmp_path: Path) -> None:
     estimator = toy_estimator()
-    save_estimator(estimator.network, tmp_path, {})
+    ESTIMATOR_FORMAT.save_half(estimator.network, tmp_path, estimator.network.config, {})
     with pytest.raises(UserError, match="trained with the touch encoder toy, .*train-estimators"):
         load_estimator(tmp_path)  # finds the shipped touch encoder
 

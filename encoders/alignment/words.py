@@ -1,4 +1,4 @@
-"""Words and pictures for a touch encoder that stays as it is (see `heads`)."""
+"""Maps of sentences and images to the embeddings of a fixed touch encoder (see `heads`)."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -36,7 +36,7 @@ def annotate_all(
 ) -> dict[str, Any]:
     """Annotate the recordings that `out` does not hold yet.
 
-    Writes one line a recording to `annotations.jsonl`, or with the reason to `left_out.jsonl`.
+    Writes one line per recording to `annotations.jsonl`, or with the reason to `left_out.jsonl`.
 
     Args:
         recordings: Recordings.

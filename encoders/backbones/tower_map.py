@@ -9,7 +9,7 @@ from torch import Tensor, nn
 class TowerMap(nn.Module):
     """Bias-free linear map of centred unit embeddings, with a hidden layer beside it if it has one.
 
-    A linear map holds the words of some hundred objects; the hidden layer those of more (`words`).
+    A linear map suffices for the sentences of about a hundred objects; for more, add the hidden layer.
     """
 
     mean: Float[Tensor, " k"]

@@ -83,11 +83,11 @@ def push(folder: Path, repository: str, private: bool, api: "HfApi") -> str:
 def pulled(repository: str, beside: Path, api: "HfApi") -> Iterator[tuple[Path, Kind]]:
     """Download an encoder or a policy; yield its temporary folder, in `beside`, and its kind.
 
-    Only JSON, safetensors and the card are downloaded, and each file is opened to check it. The
-    caller moves the folder if it likes what it finds.
+    Only JSON, safetensors and the card are downloaded, and each file is opened to check it. To
+    keep the folder, the caller moves it.
 
     Raises:
-        UserError: No network, no such repository, no access, a damaged file, or none of ours.
+        UserError: No network, no such repository, no access, a damaged file, or no model that `push` uploaded.
     """
     with TemporaryDirectory(prefix=".pull_", dir=beside) as temporary:
         folder = Path(temporary) / "model"

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 
+from touchgoal.encoders.probes.bootstrap import percentile_interval
 from touchgoal.encoders.probes.ridge import ridge_scores
 from touchgoal.encoders.whitening.covariance import inverse_square_root, within_classes
 from touchgoal.encoders.whitening.text_head import EmbedTexts, fit_text_head, rank_sentences
@@ -129,8 +130,7 @@ def interval(
         statistic(values[np.concatenate([rows[n] for n in rng.choice(names, len(names))])])
         for _ in range(_BOOTSTRAPS)
     ]
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    return float(low), float(high)
+    return percentile_interval(drawn)
 
 
 def _adapted(

@@ -1,6 +1,6 @@
 """Blocks of patches that a network reads or predicts, drawn for a whole batch.
 
-A block's size is drawn once a batch, so that its patches make a rectangular tensor; its place is
+A block's size is drawn once per batch, so that its patches make a rectangular tensor; its place is
 drawn for every image. Indices count row by row, as for `ViT.forward`; those of a block are sorted.
 """
 

@@ -59,5 +59,5 @@ class VJepa(JointEmbeddingPrediction):
 
 
 def tubes(ids: Int[Tensor, "b k"], times: int, patches: int) -> Int[Tensor, "b j"]:
-    """Repeat patches at all times of a clip with `patches` patches a frame."""
+    """Repeat patches at all times of a clip with `patches` patches per frame."""
     return torch.cat([ids + time * patches for time in range(times)], 1)

@@ -25,7 +25,7 @@ class BatchNoise:
     def draw(self, rows: int, sample: Callable[[int, torch.Generator], Drawn]) -> Drawn:
         """Return this process's rows of `sample(rows of the whole batch, generator)`.
 
-        `sample` returns a tensor, or a dict or list of such, with one entry a row.
+        `sample` returns a tensor, or a dict or list of such, with one entry per row.
         """
         own = slice(self.rank * rows, (self.rank + 1) * rows)
         return _take(sample(self.world * rows, self.generator), own)

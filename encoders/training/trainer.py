@@ -35,7 +35,7 @@ class OptimizerConfig:
     """Settings of Adam and its schedules."""
 
     epochs: int  # passes over the data
-    # samples a step over all processes; all of them if there are fewer. Samples that fill no batch
+    # samples per step over all processes; all of them if there are fewer. Samples that fill no batch
     # are left out of their epoch
     batch_size: int
     lr: float  # highest learning rate

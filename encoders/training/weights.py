@@ -5,7 +5,7 @@ Loading is strict: wrong weights give numbers that look like any others.
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -49,6 +49,14 @@ class WeightsFormat:
         ):
             save_file({name: w.contiguous() for name, w in weights.items()}, weights_file)
             json_file.write_text(json.dumps(description, indent=2) + "\n")
+
+    def save_half(
+        self, module: nn.Module, directory: Path, config: Any, provenance: dict[str, Any]
+    ) -> None:
+        """Write a module with its config, a dataclass: parameters as float16, buffers as float32."""
+        weights = {name: tensor.detach().cpu() for name, tensor in module.state_dict().items()}
+        weights |= {name: weights[name].half() for name, _ in module.named_parameters()}
+        self.save(directory, weights, asdict(config), provenance)
 
     def read_json(self, directory: Path) -> dict[str, Any]:
         """Return the JSON; UserError if it is missing, damaged or of another format."""

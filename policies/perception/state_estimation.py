@@ -4,7 +4,7 @@ A policy is trained on the simulator's truth and acts on the estimates.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -101,16 +101,6 @@ class StateEstimator:
                 "load_policy(...).env_config(), or set camera_size"
             )
         return torch.from_numpy(picture)[None]
-
-
-def save_estimator(
-    network: StateEstimatorNetwork, directory: Path, provenance: dict[str, Any]
-) -> None:
-    """Write the networks: normalizers as float32, weights as float16."""
-    weights = {name: tensor.detach().cpu() for name, tensor in network.state_dict().items()}
-    for name, _ in network.named_parameters():
-        weights[name] = weights[name].half()
-    ESTIMATOR_FORMAT.save(directory, weights, asdict(network.config), provenance)
 
 
 def load_estimator(directory: Path) -> StateEstimator:
