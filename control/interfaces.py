@@ -14,6 +14,7 @@ from jaxtyping import Float
 from touchgoal.control.arrays import Picture
 from touchgoal.control.features import Observation
 from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.runtime.errors import UserError
 
 Joints = Float[np.ndarray, "n"]
 
@@ -21,8 +22,8 @@ STOPPED_ON_REQUEST = "stopped on request"
 """Prefix of the fault message of an arm that was stopped on request."""
 
 
-class DriverError(RuntimeError):
-    """A component failed; one line says what happened and what a person can do."""
+class DriverError(UserError):
+    """A device failed; one line says what happened and what a person can do."""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,6 @@ def main(config: Config) -> None:
     from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
     from touchgoal.control.deployment.manual import without_pictures
     from touchgoal.control.deployment.preflight import check_client
-    from touchgoal.control.interfaces import DriverError
     from touchgoal.launch.support.confirm import confirm
 
     cell = without_pictures(read_cell_file(find_cell_file(config.cell)))
@@ -48,13 +47,10 @@ def main(config: Config) -> None:
     check_client(cell)
     if not config.yes:
         confirm(cell)
-    try:
-        if config.action == "recover":
-            _recover(cell)
-        else:
-            _move(config.action, cell)
-    except DriverError as error:
-        raise UserError(str(error)) from error
+    if config.action == "recover":
+        _recover(cell)
+    else:
+        _move(config.action, cell)
 
 
 def _recover(cell: "CellConfig") -> None:

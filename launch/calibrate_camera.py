@@ -71,7 +71,7 @@ def _calibrate(config: Config, path: Path, board: "Board") -> None:
     from touchgoal.control.cell.cell_file import read_cell_file
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.control.hand_eye.record import calibrate_camera
-    from touchgoal.control.interfaces import DriverError
+    from touchgoal.launch.support.cell_run import connect
     from touchgoal.launch.support.confirm import confirm
     from touchgoal.runtime.run_folder import open_run
 
@@ -83,25 +83,11 @@ def _calibrate(config: Config, path: Path, board: "Board") -> None:
     if config.poses is not None and not config.yes:
         confirm(cell)
     out = open_run(config.out, "calibrate-camera", config)
-    try:
-        with closing(_connect(cell)) as connection:
-            views = list(_views(config, cell, connection, board))
-    except DriverError as error:
-        raise UserError(str(error)) from error
+    with closing(connect(cell, new_episode=False)) as connection:
+        views = list(_views(config, cell, connection, board))
     _save_views(views, out)
     result = calibrate_camera(views, connection.robot.arm, on_hand=config.camera == "wrist")
     _report(result, config.camera, path, out, rows=views[0].image.shape[0])
-
-
-def _connect(cell: "CellConfig") -> "CellConnection":
-    from touchgoal.control import features as ft
-    from touchgoal.control.cell.connection import connect_cell
-
-    if cell.arm == "sim":
-        from touchgoal.sim_envs.cell.in_process import simulate_cell
-
-        return simulate_cell(cell, ft.CONTROL_HZ)
-    return connect_cell(cell, ft.CONTROL_HZ, new_episode=False)
 
 
 def _views(

@@ -3,7 +3,7 @@
 Distances to a goal differ in size between cameras, encoders and scenes. This command finds where
 successful episodes usually start and end, for each modality, and how far their ends lie apart, for
 each part of the cost. It writes normalizer.json, and goal.npz: the successful ends as a goal. With
---value it also learns how far along its way a picture is (value.json, value.safetensors), which
+--value it also learns to see the task's progress in images (value.json, value.safetensors), which
 `reward-curves` uses if it lies beside the normalizer. Any camera works; plain videos work for
 images.
 """
@@ -32,8 +32,8 @@ class Config:
     """Number of successes, the last ones, that fit nothing else and set the threshold of success
     (success.json): at least 9, for at most 10 % of successes rejected. 0: no threshold."""
     made_failures: CountOrNone = 0
-    """Number of these successes of which seven kinds of failure are made each, from their pictures, to
-    see how many pass the threshold."""
+    """Number of these successes from whose images seven kinds of failure are made, to see how many
+    pass the threshold."""
     camera: str = "front"
     """Camera of the plain distance of images, such as front, wrist or a LeRobot set's top."""
     keys: Annotated[tuple[str, ...], RARE] = ()

@@ -49,8 +49,8 @@ class Config:
     """Normalizer of the distances: a normalizer.json of fit-normalizer; encoder, the one that comes
     with the encoder; or none. Default: the encoder's one for simulated pick-and-place, else none."""
     gamma: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Discount a second of the potential-based reward gamma * Phi' - Phi, in (0, 1]; with 1 standing
-    still pays nothing. For an RL algorithm that discounts by g a frame it is g to the power of fps."""
+    """Discount per second of the potential-based reward gamma * Phi' - Phi; with 1 standing still pays
+    nothing. For an RL algorithm that discounts by g per frame it is g to the power of fps."""
     plots: CountOrNone = 100
     """Number of trajectories, from the first, that get a plot of their own."""
     audit: CountOrNone = 0
@@ -97,7 +97,7 @@ def main(config: Config) -> None:
     if any(isinstance(goal, Bank) for goal in goals.values()):
         print("failures are among the episodes: the goal is the nearest end of other successes")
     elif OwnFrame() in given and any(t.meta.get("success") is False for t in source.trajectories):
-        print("failures are among the trajectories, and to last each of them ends at cost 0, too")
+        print("failures are among the trajectories; with goal last they end at cost 0, too")
     first = given or list(goals.values())[:1]
     model = load_reward_model(
         source.inputs, first, config.encoder, config.towers, config.normalizer, config.device

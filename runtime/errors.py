@@ -8,7 +8,7 @@ _MARKS = {True: "ok", False: "MISSING", None: "-"}
 
 
 class UserError(ValueError):
-    """A mistake that the user can correct; the message is one line that says how.
+    """Something that the user can correct; the message is one line that says how.
 
     Commands print the message and exit with 1; any other exception is a bug and shows its traceback.
     """

@@ -50,7 +50,6 @@ POLICY_TEST = SeedRange(5_000_000, 1_000_000)  # benchmark policy-delay, bead-ma
 DEPLOY_TEST = SeedRange(6_000_000, 2_000_000)  # benchmark deploy
 REPLAY = SeedRange(8_000_000, 1_000_000)  # benchmark replay
 DEMO = SeedRange(9_000_000, 1_000_000)
-WORDS_TEST = SeedRange(10_000_000, 1_000_000)  # grasps that benchmark zero-shot names
 
 WIRES: dict[str, SeedRange] = {  # shapes of wires have seeds apart from the episodes'
     "test": SeedRange(0, 1_000_000),

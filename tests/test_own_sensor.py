@@ -53,7 +53,7 @@ def session() -> list[np.ndarray]:
 
 
 def test_every_press_is_kept_once_where_it_was(session: list[np.ndarray]) -> None:
-    recorder = PressRecorder((240, 320), a_cell=1)
+    recorder = PressRecorder((240, 320), per_cell=1)
     kept = [recorder.update(frame) for frame in session]
     assert recorder.complete and sum(kept) == 12
     found = np.array(recorder.circles)[:, :2] - [159.5, 119.5]

@@ -127,7 +127,7 @@ class DriverProcess:
 
 def _picklable(error: Exception) -> Exception:
     """Return an exception that the parent can unpickle without the client's library."""
-    if isinstance(error, UserError | DriverError):
+    if isinstance(error, UserError):
         return error
     return DriverError(error_line(error))
 
@@ -135,7 +135,7 @@ def _picklable(error: Exception) -> Exception:
 def error_line(error: Exception) -> str:
     """Return the message for a person, on one line."""
     text = " ".join(str(error).split())
-    return text if isinstance(error, UserError | DriverError) else f"{type(error).__name__}: {text}"
+    return text if isinstance(error, UserError) else f"{type(error).__name__}: {text}"
 
 
 def _alarm(seconds: float) -> None:

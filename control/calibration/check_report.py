@@ -84,7 +84,7 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
 
 
 def picture(check: SensorCheck) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw a row a press: frame, simulated frame, change of each times 4 about grey, depth."""
+    """Draw one row per press: frame, simulated frame, change of each times 4 about grey, depth."""
     rows = [_row(press, check.background) for press in check.presses[:_SHOWN]]
     return np.vstack(rows or [np.hstack([check.background] * 2)])
 

@@ -34,12 +34,12 @@ _SIDES = {
 class PressRecorder:
     """Recorder of one picture per press: the first in which the ball stands still.
 
-    `shape` is that of the frames (rows, columns); `a_cell` is the number of presses wanted in each
+    `shape` is that of the frames (rows, columns); `per_cell` is the number of presses wanted in each
     cell of the map.
     """
 
-    def __init__(self, shape: tuple[int, int], a_cell: int = 2) -> None:
-        self._shape, self._a_cell = shape, a_cell
+    def __init__(self, shape: tuple[int, int], per_cell: int = 2) -> None:
+        self._shape, self._per_cell = shape, per_cell
         self.grid = GRID if shape[1] >= shape[0] else GRID[::-1]
         self.images: list[Picture] = []
         self.circles: list[np.ndarray] = []  # as `find_circle` finds them, px
@@ -67,7 +67,7 @@ class PressRecorder:
     @property
     def complete(self) -> bool:
         """Whether every cell has its presses."""
-        return bool((self.counts >= self._a_cell).all())
+        return bool((self.counts >= self._per_cell).all())
 
     def presses(self, ball_radius: float, first: int = 0) -> PressSet:
         """Return the recorded presses of a ball (radius, m), numbered from `first`."""
@@ -104,9 +104,9 @@ class PressRecorder:
         for (row, column), count in np.ndenumerate(self.counts):
             left, top = column * size[0] // columns, row * size[1] // rows
             right, bottom = (column + 1) * size[0] // columns, (row + 1) * size[1] // rows
-            colour = (0, 158, 115) if count >= self._a_cell else (213, 94, 0)
+            colour = (0, 158, 115) if count >= self._per_cell else (213, 94, 0)
             cv2.rectangle(picture, (left + 2, top + 2), (right - 3, bottom - 3), colour, 1)
-            _write(picture, f"{count}/{self._a_cell}", (left + 8, top + 20), colour)
+            _write(picture, f"{count}/{self._per_cell}", (left + 8, top + 20), colour)
         for x, y, radius in self.circles:
             centre = round((x + 0.5) * scale), round((y + 0.5) * scale)
             cv2.circle(picture, centre, round(radius * scale), (255, 255, 255), 1, cv2.LINE_AA)

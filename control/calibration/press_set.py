@@ -34,7 +34,7 @@ class PressSet:
     # contact circles as given or found: centre x (column), centre y (row) and radius, px; the
     # centre of the first pixel is (0, 0)
     circles: Circles
-    ball_radius: Float[np.ndarray, " n"]  # m, one a press; all NaN if not known
+    ball_radius: Float[np.ndarray, " n"]  # m, one per press; all NaN if not known
     files: tuple[str, ...]  # name of each picture
     labelled: bool = True  # whether the circles were given, not found in the pictures
 
@@ -122,7 +122,7 @@ def _read_rows(folder: Path, ball_mm: float) -> list[tuple[str, Circle, float]]:
         if math.isnan(ball_mm):
             raise UserError(
                 f"{path} is missing: give --ball-mm if one ball made all presses, or write one line "
-                "a press with the columns file,ball_mm (docs/own_sensor.md)"
+                "per press with the columns file,ball_mm (docs/own_sensor.md)"
             )
         pictures = {p.name for p in folder.iterdir() if p.suffix.lower() in (".png", ".jpg")}
         unknown = np.full(3, math.nan)

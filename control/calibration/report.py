@@ -22,7 +22,7 @@ _USELESS = 0.9  # L1 errors above this share of the background's: the fit explai
 _AT_LIMIT = 0.2  # share of circles at a search limit that is worth a warning
 _MAX_SHOWN = 6  # held-out presses in the picture
 _CONTRAST = 4  # factor on the difference in its column
-_PAIRS_A_ROW = 2
+_PAIRS_PER_ROW = 2
 _LIGHTS = {"R": (213, 94, 0), "G": (0, 158, 115), "B": (0, 114, 178)}  # Okabe and Ito
 _GREY, _INK, _PAPER = (150, 150, 150), (40, 40, 40), 255
 
@@ -200,11 +200,13 @@ def side_by_side(
         picture = made.clip(0, 255)
         difference = (128 + _CONTRAST * (real - picture)).clip(0, 255)
         tiles.append(np.hstack([real, picture, difference]).astype(np.uint8))
-    tiles += [np.full_like(tiles[0], _PAPER)] * (-len(tiles) % _PAIRS_A_ROW)
-    rows = [np.hstack(tiles[i : i + _PAIRS_A_ROW]) for i in range(0, len(tiles), _PAIRS_A_ROW)]
+    tiles += [np.full_like(tiles[0], _PAPER)] * (-len(tiles) % _PAIRS_PER_ROW)
+    rows = [np.hstack(tiles[i : i + _PAIRS_PER_ROW]) for i in range(0, len(tiles), _PAIRS_PER_ROW)]
     width = tiles[0].shape[1] // 3
     heading = np.full((24, rows[0].shape[1], 3), _PAPER, np.uint8)
-    for i, text in enumerate(("measured", "simulated", f"difference x{_CONTRAST}") * _PAIRS_A_ROW):
+    for i, text in enumerate(
+        ("measured", "simulated", f"difference x{_CONTRAST}") * _PAIRS_PER_ROW
+    ):
         _write(heading, text, (i + 0.5) * width, 12, _INK)
     return np.vstack([heading, *rows])
 

@@ -157,7 +157,7 @@ class TaskSection:
     """Normaliser of that distance: a normalizer.json that fit-normalizer made from successes in this cell.
     Default: the encoder's own on a simulated arm or a twin, the raw distance elsewhere."""
     give_up: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
-    """Rise of that distance above its lowest in the run which, kept for a second, ends the run as failed; 0:
+    """Rise of that distance above its lowest value that ends the run as failed, if it lasts a second; 0:
     never."""
 
     @property

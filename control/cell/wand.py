@@ -6,7 +6,6 @@ from dataclasses import dataclass as plain_dataclass
 from dataclasses import field, replace
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 from pydantic import Field
@@ -15,6 +14,7 @@ from pydantic.dataclasses import dataclass
 from touchgoal.control import features as ft
 from touchgoal.control.arrays import Picture
 from touchgoal.control.cell.config import CameraSection, Exposure, Kelvin, Pixels
+from touchgoal.control.deployment.observation import crop_and_resize
 from touchgoal.control.interfaces import Camera, LoadCell, TactileSensor
 from touchgoal.control.sensors.fingertip_source import fingertip_video
 from touchgoal.control.sensors.load_cell import LoadCellConfig, SerialLoadCell
@@ -97,7 +97,10 @@ class Wand:
         if frame.sequence == self._last:
             return None
         self._last = frame.sequence
-        views = {name: _square(camera.read().image) for name, camera in self.cameras.items()}
+        views = {
+            name: crop_and_resize(camera.read().image, VIEW_SHAPE)
+            for name, camera in self.cameras.items()
+        }
         return WandReading(frame.image, views, self.load_cell.read().force)
 
     def problem(self) -> str:
@@ -141,12 +144,3 @@ def _open_gel(own: GelSection) -> TactileCamera:
     locked = replace(video, size=own.size, exposure=own.exposure, white_balance=own.white_balance)
     view = fingertip_view(model, own.source, own.border, own.corners)
     return TactileCamera(VideoCamera(locked), model, view)
-
-
-def _square(picture: Picture) -> UInt8[np.ndarray, "H W 3"]:
-    """Cut the middle square out of a camera's picture and scale it."""
-    height, width, _ = picture.shape
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    square = picture[top : top + side, left : left + side]
-    return cv2.resize(square, VIEW_SHAPE, interpolation=cv2.INTER_AREA)

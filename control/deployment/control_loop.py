@@ -178,7 +178,7 @@ class ControlLoop:
             real = isinstance(self._connection.clock, RealClock)
             with _realtime_priority() if real else nullcontext():
                 return self._loop(actor, seconds, log)
-        except (DriverError, UserError) as error:
+        except UserError as error:
             return self._arm_first(self.stop(str(error), "check what it names, then start again"))
         except Exception as error:  # most likely the policy's error; stop the arm in any case
             message, origin = " ".join(str(error).split()), extract_tb(error.__traceback__)[-1]

@@ -23,7 +23,7 @@ from touchgoal.control.safety.action_filter import ActionFilter
 
 _TIMEOUT = 60.0  # s for a move
 _STILL_SECONDS = 1.0  # s for which a hand must stand still to have arrived
-_THERE = 1e-3  # rad from a posture that need not be moved to
+_THERE = 1e-3  # rad; an arm this near a posture need not move to it
 
 
 def without_pictures(cell: CellConfig) -> CellConfig:

@@ -95,7 +95,7 @@ def _sequences(connection: CellConnection) -> dict[str, int]:
 def _run_check(what: str, check: Callable[[], str]) -> CheckResult:
     try:
         return CheckResult(what, True, check())
-    except (UserError, DriverError, OSError) as error:  # such as a disk that takes no file
+    except (UserError, OSError) as error:  # such as a disk that takes no file
         return CheckResult(what, False, "", str(error))
 
 

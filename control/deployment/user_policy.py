@@ -1,7 +1,7 @@
 """A user's own policy: a class with two methods, `module:Class` or `file.py:Class`
 (docs/own_policy.md).
 
-The class is made without arguments, once an episode, in the process that simulates it. An optional
+The class is made without arguments, once per episode, in the process that simulates it. An optional
 method `env_config(config)` returns the options of the environment that it needs, such as its
 cameras.
 """

@@ -175,13 +175,9 @@ class Kinematics:
         free, pull, error = np.ones(q.size), np.empty(1), np.full(6, np.inf)
         posture = posture if q.size > 6 else 0.0
         buffer, step = self._step.buffer()
-        inputs, results = (
-            (q, target, pull, free, held),
-            (change, error),
-        )  # the buffer points to them
-        for i, value in enumerate(inputs):
+        for i, value in enumerate((q, target, pull, free, held)):
             buffer.set_arg(i, value.data)  # pyright: ignore[reportCallIssue]
-        for i, value in enumerate(results):
+        for i, value in enumerate((change, error)):
             buffer.set_res(i, value.data)  # pyright: ignore[reportCallIssue]
         for i in range(_ITERATIONS):
             free[:], pull[0] = 1.0, posture * max(0.0, 1 - i / _PULLED)

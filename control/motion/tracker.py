@@ -54,7 +54,7 @@ class Tracker:
         k = max(1, int(np.ceil((2 * limits.acceleration / limits.jerk / dt).max())))
         self._weights = np.convolve(np.full(self._m, 1 / self._m), np.full(k, 1 / k))
         self.lag = (self._weights.size - 1) / 2 * dt
-        # rad a tick: largest change of the reference's step over the window
+        # rad per tick: largest change of the reference's step over the window
         self._reach = limits.acceleration * self._m * dt**2
         self._fastest = np.minimum(limits.velocity * dt, self._reach)
         self.step(self.start(speed))  # compiles now, not in a loop

@@ -27,7 +27,7 @@ from touchgoal.runtime.picture_file import read_picture
 _PICTURES = (".png", ".jpg", ".jpeg")
 _UNTOUCHED = "background.png"  # untouched sensor of a folder of presses
 _POLL_INTERVAL = 0.005  # s between looks for a new frame
-_TIMEOUT = 5.0  # s without any
+_TIMEOUT = 5.0  # s without a new frame after which the sensor counts as lost
 
 
 def is_recorded(source: str) -> bool:

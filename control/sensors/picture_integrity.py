@@ -47,10 +47,10 @@ class JpegDecoder:
 
 
 class BrokenBlocks:
-    """Detector of a gel's pictures that came through a broken JPEG, judged by the last good one.
+    """Finds pictures of a gel from a damaged JPEG, by their change from the last good picture.
 
-    A decoder cannot detect every wrong byte. It shows as blocks of another brightness, which a
-    smooth gel never has: real changes ignore block borders. Moving dots do look like such blocks,
+    A decoder cannot detect every wrong byte. One that it misses shows as blocks of another
+    brightness, which a smooth gel never has: real changes ignore block borders. Moving dots do look like such blocks,
     so pixels near dots do not count; `dots` is their diameter as a share of the picture's diagonal,
     0 without.
     """

@@ -46,7 +46,8 @@ class VideoConfig:
     # s after which an identical picture, or part of one, counts as old; infinity for rendered
     # pictures, which lack the noise of real ones
     frozen_after: float = 0.5
-    # and identical pictures in a row, for a lock-step twin, whose time is not wall time
+    # more identical pictures in a row than this are needed, too: a lock-step twin's time is not wall
+    # time
     frozen_pictures: int = 0
     gel: bool = False  # a fingertip's: smooth but for its dots, so broken pictures show
     dots: float = 0.0  # diameter of the printed dots as a share of the picture's diagonal; 0: none

@@ -22,7 +22,7 @@ _WAVES = 4, 5
 _RATE = 0.02  # weight of a new frame: a time constant of 2 s at 25 Hz, slower than contacts
 # Standard deviations between 150,000 real touches of Minis (Tactile-MNIST), counts.
 _OFFSET_SPREAD, _PATTERN_SPREAD = 2.4, 2.4
-_MOVED = 1.5  # counts of local change among the first frames that noise does not reach
+_MOVED = 1.5  # counts of local change among the first frames, more than noise alone makes
 _JITTER = 1.0  # px by which a camera shakes; dots that move farther together are a touch
 _ANOTHER_SENSOR = 5.0  # counts of local change to a reference; the usual drift gives 3
 
@@ -122,7 +122,7 @@ def _shifted(
     sides = [
         cv2.filter2D(structure, -1, k, borderType=cv2.BORDER_REPLICATE) for k in (kernel, kernel.T)
     ]
-    slopes = np.stack([side.ravel() for side in sides])  # counts a px, along x and y
+    slopes = np.stack([side.ravel() for side in sides])  # counts per px, along x and y
     normal = slopes @ slopes.T + np.eye(2, dtype=np.float32)
     shift = np.linalg.solve(normal, slopes @ change.ravel())
     shift *= min(1, _JITTER / max(float(np.hypot(*shift)), 1e-6))

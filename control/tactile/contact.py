@@ -13,7 +13,7 @@ THRESHOLD = 1.2  # counts; noise of 1 count has a strength of 0.3, at most 0.45
 _SPARE = 2.5
 _LEARNING_FRAMES = 10  # 0.4 s of a 25 Hz sensor
 _LEARNING_QUANTILE = 0.3
-_OVER_NOISE = 1.8  # factor on the usual noise, below which a contact ends in any case
+_OVER_NOISE = 1.8  # multiple of the usual noise below which any contact ends
 _LEARNING_THRESHOLD = 5.0  # counts; the strongest compression noise measured had a strength of 2.5
 # Strength of a change per its median over the picture, above which it is no noise: Gaussian noise
 # reaches 6, presses of balls on a real Mini 16 to 25.

@@ -44,10 +44,10 @@ class DepthEstimator:
     """Reconstruction of the gel's surface from single frames of one sensor.
 
     Walls steeper than the file's `max_slope` read too low, unless the depth's own colour (up to
-    `max_depth`) shows how deep they go. Where colours leave it open, depth counts from the lowest
-    tenth of the surface: too shallow if a contact fills the view. `finest` is the side of the
-    smallest cells, px: 8 takes a third of the time of 2 and finds the deepest point of most
-    contacts as well.
+    `max_depth`) shows how deep they go. Where colours do not determine the depth, the lowest tenth
+    of the surface counts as gel at rest: too shallow if a contact fills the view. `finest` is the
+    side of the smallest cells, px: 8 takes a third of the time of 2 and finds the deepest point of
+    most contacts as well.
     """
 
     def __init__(self, calibration: SensorCalibration, finest: int = 2) -> None:

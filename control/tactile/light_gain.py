@@ -26,8 +26,8 @@ _LEAST_GAIN = 0.04  # gain of an almost black picture
 def light_gain(picture: AnyPicture, untouched: AnyPicture) -> Float32[np.ndarray, "3"]:
     """Return the factor of each channel's brightness between two RGB pictures of a fingertip.
 
-    It is the median ratio over a grid of cells, which a contact of less than half the gel leaves
-    alone. Cells that are dark or clipped do not count; a channel without others keeps 1.
+    It is the median ratio over a grid of cells, so a contact of less than half the gel does not
+    change it. Cells that are dark or clipped do not count; a channel without other cells has 1.
     """
     now, before = _cells(picture), _cells(untouched)
     usable = (before > _DARK) & (before < _BRIGHT) & (now < _BRIGHT)

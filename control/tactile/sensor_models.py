@@ -28,7 +28,7 @@ class SensorModel:
     name: str  # id that encoders and preprocessors use
     image_shape: tuple[int, int]  # (rows, columns) of a frame
     pixel_pitch: float  # m of gel per pixel; square pixels
-    pitch_range: tuple[float, float]  # (least, most) among sensors of this model, m a pixel
+    pitch_range: tuple[float, float]  # (least, most) among sensors of this model, m per pixel
     gel_size: tuple[float, float]  # (along x, along y) of the gel, m
     gel_thickness: float  # m
     case_size: tuple[float, float, float]  # (along x, along y, depth) of the housing, m

@@ -31,7 +31,7 @@ class KeyboardDevice:
         self._gripper: GripperRequest = ""
 
     def press(self, keys: str) -> None:
-        """Take typed keys, in this order; a key ends its opposite, others have no meaning."""
+        """Take typed keys, in this order; a key cancels its opposite, unknown ones are ignored."""
         for key in keys:
             self._gripper = _GRIPPER.get(key, self._gripper)
             if key in _AXES:
@@ -46,4 +46,4 @@ class KeyboardDevice:
         return HandMotion(twist, self._gripper)
 
     def close(self) -> None:
-        """Do nothing: the terminal is another's."""
+        """Do nothing: `Terminal` owns the terminal."""

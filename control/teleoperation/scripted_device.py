@@ -7,12 +7,12 @@ from collections import deque
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.scripted import PickPlacePoses
 from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import Vector3, fingers_down, rotation_vector
-from touchgoal.control.motion.rotations import rotation_matrix as rotation
 from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, Verdict
 
 _SLOW_WITHIN = 0.06, 0.4  # m and rad from a way-point within which the deflection shrinks
@@ -42,7 +42,8 @@ class ScriptedDevice:
         """Return the motion to the present way-point."""
         pose = observation[ft.TCP_POSE].astype(np.float64)
         self._position, self._width = pose[:3], float(observation[ft.STATE][-1])
-        self._error = rotation_vector(self._R @ _matrix(pose[3:]).T)
+        R = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix()
+        self._error = rotation_vector(self._R @ R.T)
         self._recent.append(np.append(self._position, self._width))
         return next(self._motions)
 
@@ -84,11 +85,3 @@ class ScriptedDevice:
 
 def _limited(share: Vector3) -> Vector3:
     return share / max(1.0, float(np.linalg.norm(share)))
-
-
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix of a unit quaternion, wxyz."""
-    w, vector = quaternion[0], quaternion[1:]
-    sine = float(np.linalg.norm(vector))
-    axis = vector / sine if sine > 0 else vector
-    return rotation(2 * np.arctan2(sine, w) * axis)

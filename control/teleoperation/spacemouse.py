@@ -29,7 +29,7 @@ _MAKERS = (0x256F, 0x046D)  # USB vendors: 3Dconnexion, and Logitech for those b
 _LOGITECH_PRODUCTS = range(0xC621, 0xC62C)  # Logitech's 3D mice: 0xC625 to 0xC62B are in use
 _FULL_SCALE = 350.0  # counts at full deflection (`axis_scale` of the table)
 _DEAD_ZONE = 0.06  # share of it: a cap at rest may be off by some counts
-_SILENCE = 0.5  # s; a deflected cap reports all the time: then it was let go, or its radio is lost
+_SILENCE = 0.5  # s without a report after which the cap counts as released: deflected, it reports
 _LONGEST = 64  # bytes of a report over USB full speed
 # From the device's axes to the base's, for a user who looks the way the robot does.
 _TO_BASE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -74,7 +74,7 @@ class SpaceMouse:
         return HandMotion((share.reshape(2, 3) @ _TO_BASE.T).ravel(), self._gripper)
 
     def take(self, report: bytes) -> None:
-        """Take one report; others than those of motion and buttons have no meaning."""
+        """Take one report; only those of motion and buttons count."""
         kind, values = report[0], report[1:]
         if kind == 1 and len(values) >= 12:
             self._counts[:] = struct.unpack("<6h", values[:12])

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from touchgoal.runtime.errors import UserError, require_all_ok
+from touchgoal.runtime.errors import require_all_ok
 
 if TYPE_CHECKING:
     import numpy as np
@@ -13,24 +13,20 @@ if TYPE_CHECKING:
     from touchgoal.control.safety.action_filter import ActionFilter
 
 
-def connect(cell: "CellConfig") -> "CellConnection":
-    """Connect to the cell, once a twin has put its scene back."""
+def connect(cell: "CellConfig", new_episode: bool = True) -> "CellConnection":
+    """Connect to the cell; for a new episode a twin first puts its scene back."""
     from touchgoal.control import features as ft
     from touchgoal.control.cell.connection import connect_cell
     from touchgoal.control.cell.twin_client import reset_scene
-    from touchgoal.control.interfaces import DriverError
 
     if cell.arm == "sim":
         from touchgoal.sim_envs.cell.in_process import simulate_cell
 
         return simulate_cell(cell, ft.CONTROL_HZ)
-    if cell.task.twin:
+    if cell.task.twin and new_episode:
         reset_scene(cell.task.twin, cell.task.seed)
         print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
-    try:
-        return connect_cell(cell, ft.CONTROL_HZ)
-    except DriverError as error:
-        raise UserError(str(error)) from error
+    return connect_cell(cell, ft.CONTROL_HZ, new_episode)
 
 
 def check_cell(cell: "CellConfig", connection: "CellConnection", episodes: Path) -> "ActionFilter":
