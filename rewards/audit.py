@@ -2,7 +2,7 @@
 
 Each episode is measured again with its touch replaced; goals stay as they were. Differences are
 paired by episode, their intervals a bootstrap over episodes. The goal must not be a frame of the
-episode itself: against its own end every replacement costs more, whatever touch is worth.
+episode itself: against its own end every replacement costs more, even if touch is useless.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,8 +12,10 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float, Int
 
+from touchgoal.encoders.probes.bootstrap import mean_interval, percentile_interval
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.parts import FUSED
 from touchgoal.rewards.features.contact_reading import ContactReadings
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.metrics import auc, measure_curve
@@ -35,7 +37,7 @@ METRICS = {
     "order": "rank correlation of falling cost with time, mean over successes",
     "last cost": "cost of the last frame, mean over successes",
     "lag": "frames from first contact to half of the fall, mean over successes",
-    "AUC": "of the last cost, success against failure",
+    "AUC": "share of (failure, success) pairs in which the failure has the higher last cost",
 }
 """Meaning of each metric."""
 
@@ -80,10 +82,11 @@ class AuditTable:
         if not self.mattered:
             return f"no sign that touch mattered: shuffled in time, the order changes by {change}"
         other = self._row("last cost", "another's")
-        whose = "another episode's touch ends no differently"
+        swapped = "with another episode's touch the last cost is no higher"
         if other is not None and other.low > 0:
-            whose = f"another episode's touch ends {other.replaced - other.real:.2f} farther away"
-        return f"touch mattered: shuffled in time, the cost's order changes by {change}; {whose}"
+            rise = other.replaced - other.real
+            swapped = f"with another episode's touch the last cost is {rise:.2f} higher"
+        return f"touch mattered: shuffled in time, the cost's order changes by {change}; {swapped}"
 
     @property
     def table(self) -> str:
@@ -110,29 +113,25 @@ def audit_touch(
     episodes: Sequence[EmbeddedEpisode],
     goals: Sequence[EmbeddedGoal],
     measure: Measure,
-    curve: str = "fused",
 ) -> AuditTable:
-    """Return how each metric of a curve changes with each replacement of touch.
+    """Return how each metric of the fused cost changes with each replacement of touch.
 
     Episodes without a recorded outcome count as successes. UserError: fewer than two episodes, one
     without touch, or one with a frame of itself as goal.
 
     Args:
         episodes: at least two, embedded alike, with touch.
-        goals: one an episode, of other episodes.
+        goals: one per episode, from other episodes.
         measure: returns the curves of an episode to a goal.
-        curve: name of the curve.
     """
     _check(episodes, goals)
-    if curve not in measure(episodes[0], goals[0]).costs:
-        raise UserError(
-            f"an audit of touch needs the curve '{curve}': give a --normalizer with units"
-        )
-    real = _measured(episodes, goals, measure, curve)
+    if FUSED not in measure(episodes[0], goals[0]).costs:
+        raise UserError("an audit of touch needs the fused cost: give a --normalizer with units")
+    real = _measured(episodes, goals, measure)
     rng, rows = np.random.default_rng(0), []
     replaced = {
         name: _measured(
-            [_replace(name, episodes, k, rng) for k in range(len(episodes))], goals, measure, curve
+            [_replace(name, episodes, k, rng) for k in range(len(episodes))], goals, measure
         )
         for name in REPLACEMENTS
     }
@@ -169,8 +168,8 @@ def _check(episodes: Sequence[EmbeddedEpisode], goals: Sequence[EmbeddedGoal]) -
             raise UserError(f"{episode.source} has no touch to audit: leave --audit out")
         if goal.same_episode:
             raise UserError(
-                f"the goal of {episode.source} is a frame of itself, which decides an audit of "
-                "touch beforehand: give the end of another episode, or a bank of them"
+                f"the goal of {episode.source} is a frame of itself, so the audit of touch proves "
+                "nothing: give the end of another episode, or a bank of them"
             )
 
 
@@ -225,12 +224,11 @@ def _measured(
     episodes: Sequence[EmbeddedEpisode],
     goals: Sequence[EmbeddedGoal],
     measure: Measure,
-    curve: str,
 ) -> dict[str, Float[np.ndarray, " episodes"]]:
     """Return each metric of each episode, NaN where it is undefined."""
     found = []
     for episode, goal in zip(episodes, goals, strict=True):
-        metrics = measure_curve(measure(episode, goal).costs[curve], episode.contact.frame)
+        metrics = measure_curve(measure(episode, goal).costs[FUSED], episode.contact.frame)
         found.append((metrics.spearman, metrics.end, metrics.contact_lag))
     order, last, lag = np.array(found, float).T
     return {"order": order, "last cost": last, "lag": lag}
@@ -243,23 +241,17 @@ def _row(
     replaced: dict[str, Float[np.ndarray, " n"]],
     failed: np.ndarray,
 ) -> AuditRow:
-    rng = np.random.default_rng(0)
     if metric == "AUC":
+        rng = np.random.default_rng(0)
         good, bad = np.flatnonzero(~failed), np.flatnonzero(failed)
         last, new = real["last cost"], replaced["last cost"]
         before, after = auc(last[good], last[bad]), auc(new[good], new[bad])
         drawn = [(rng.choice(good, len(good)), rng.choice(bad, len(bad))) for _ in range(_DRAWS)]
         changes = [auc(new[g], new[b]) - auc(last[g], last[b]) for g, b in drawn]
-        return AuditRow(metric, replacement, before, after, *_limits(np.array(changes)))
+        return AuditRow(metric, replacement, before, after, *percentile_interval(changes))
     both = np.isfinite(real[metric]) & np.isfinite(replaced[metric]) & ~failed
     before, after = real[metric][both], replaced[metric][both]
     if len(before) < 2:
         return AuditRow(metric, replacement, np.nan, np.nan, np.nan, np.nan)
-    rows = rng.integers(len(before), size=(_DRAWS, len(before)))
-    limits = _limits((after - before)[rows].mean(axis=1))
+    limits = mean_interval(after - before, _DRAWS)
     return AuditRow(metric, replacement, float(before.mean()), float(after.mean()), *limits)
-
-
-def _limits(draws: Float[np.ndarray, " draws"]) -> tuple[float, float]:
-    low, high = np.quantile(draws, (0.025, 0.975))
-    return float(low), float(high)

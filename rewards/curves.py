@@ -28,7 +28,7 @@ PLAIN = frozenset({"image", "tactile", "text", *FUSED})
 """Plain distances of embeddings and their means, which stand beside the parts for comparison."""
 
 GAMMA = 1.0
-"""Default discount a second of the potential-based reward: standing still pays nothing."""
+"""Default discount per second of the potential-based reward: standing still pays nothing."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Curves:
     def potential_rewards(self, gamma: float = GAMMA) -> dict[str, Float[np.ndarray, " n"]]:
         """Return the potential-based reward of the step into each frame, by name of the curve.
 
-        `gamma` is the discount a second. An algorithm that discounts by g a frame wants g^fps.
+        `gamma` is the discount per second: g^fps for an algorithm that discounts by g per frame.
         """
         step = gamma ** (1 / self.fps)
         return {name: potential_reward(d, step) for name, d in self.costs.items()}
@@ -140,7 +140,7 @@ def main_curve(names: Iterable[str]) -> str:
 
 
 def reference_levels(names: Iterable[str], normalised: bool) -> list[tuple[float, str]]:
-    """Return the costs that mean something, and what: for parts, for normalised distances, or none."""
+    """Return reference levels of a cost axis with their labels; none for raw distances."""
     if "fused" in names:
         return [(0.0, "goal"), (1 / 3, "spread of successes"), (1.0, "far")]
     return [(0.0, "usual end"), (1.0, "usual start")] if normalised else []
@@ -154,8 +154,8 @@ def state_reward(cost: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 def potential_reward(cost: Float[np.ndarray, " n"], gamma: float) -> Float[np.ndarray, " n"]:
     """Return F_t = gamma Phi_t - Phi_{t-1} with Phi = -cost, F_0 = 0 (Ng et al. 1999, equation 2).
 
-    `gamma` is the discount a step. With 1 it sums to cost_0 - cost_T over any path, 0 over a hold.
-    With less, a hold pays (1 - gamma) cost a step: distance is rewarded, and the more the longer.
+    `gamma` is the discount per step. With gamma = 1 it sums to cost_0 - cost_T over any path.
+    With a smaller gamma, standing still earns (1 - gamma) cost per step: more, farther from the goal.
     """
     potential = state_reward(cost)
     return np.concatenate([np.zeros(1), gamma * potential[1:] - potential[:-1]])

@@ -15,9 +15,9 @@ from touchgoal.runtime.errors import UserError
 def goals_of(trajectories: Sequence[Trajectory]) -> dict[str, GoalSpec]:
     """Return the goal of each trajectory by name, where the user gave none.
 
-    That is its own last frame; if one of them failed, the nearest end of the other successes of the
-    set with the same object. The only success with an object keeps its own end. UserError: a failure
-    among videos, or an object without a success.
+    That is its own last frame. If a trajectory failed, it is the nearest end of the set's other
+    successes with the same object; a success that is the only one with its object keeps its own end.
+    UserError: a failure among videos, or an object without a success.
     """
     failed = [t for t in trajectories if t.meta.get("success") is False]
     if not failed:

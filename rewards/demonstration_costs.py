@@ -44,8 +44,8 @@ def accepted_failures(
 ) -> dict[str, tuple[int, int]]:
     """Return how many failures made from successes pass a threshold, of how many, by kind.
 
-    The next success with another object lends its touch to the wrong object; without one there is no
-    such failure. One whose pictures are refused (`UserError` of `last_cost`) does not pass.
+    The kind "wrong_object" takes its touch from the next success with another object; without one it
+    is not made. A failure whose images `last_cost` refuses (UserError) does not pass.
     """
     passed: dict[str, list[bool]] = {kind: [] for kind in MADE}
     for k, success in enumerate(successes):

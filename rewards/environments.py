@@ -7,13 +7,13 @@ from typing import Any, Literal, overload
 import gymnasium as gym
 
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs import tasks
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.for_rl import ForRL
 from touchgoal.sim_envs.pick_place import PickPlace
 
 Touch = Literal["picture", "embedding"]
 Reward = Literal["progress", "touch"]
+_ENVIRONMENTS = {env.task: env for env in (PickPlace, BeadMaze)}
 
 
 @overload
@@ -21,7 +21,6 @@ def make(
     task: Literal["pick-place"],
     *,
     for_rl: Literal[False] = False,
-    render_mode: str | None = None,
     **options: Any,
 ) -> PickPlace: ...
 @overload
@@ -29,7 +28,6 @@ def make(
     task: Literal["bead-maze"],
     *,
     for_rl: Literal[False] = False,
-    render_mode: str | None = None,
     **options: Any,
 ) -> BeadMaze: ...
 @overload
@@ -42,7 +40,6 @@ def make(
     goal: str | None = None,
     normalizer: str | Path | None = None,
     encoder: str | Path | None = None,
-    render_mode: str | None = None,
     **options: Any,
 ) -> ForRL: ...
 def make(
@@ -54,7 +51,6 @@ def make(
     goal: str | None = None,
     normalizer: str | Path | None = None,
     encoder: str | Path | None = None,
-    render_mode: str | None = None,
     **options: Any,
 ) -> gym.Env:
     """Make the Gymnasium environment of a task.
@@ -65,24 +61,25 @@ def make(
     Args:
         task: "pick-place" or "bead-maze".
         for_rl: keys without dots and actions in [-1, 1]; see `sim_envs.for_rl.ForRL`.
-        touch: tactile images in a quarter of their size, or embeddings. This and what follows needs
-            `for_rl`.
+        touch: tactile images at a quarter of their size, or embeddings. This option and the next
+            four need `for_rl`.
         reward: gain in the task's progress, or the fall of the cost to a goal.
         goal: goal of reward "touch", outside the episode: "goal:FILE", "bank:SET", "episode:SET#K".
         normalizer: normalizer.json of reward "touch"; default: the touch encoder's own.
         encoder: touch encoder of embeddings and of reward "touch"; default: the one that ships for the
             sensor.
-        render_mode: "rgb_array" for wrappers that record videos.
         options: fields of the task's config by name, such as `cameras=("front",)`,
             `camera_size=(96, 96)` or `tactile=False`: see `PickPlaceConfig` and `BeadMazeConfig`.
-            Of a field that is a config itself a dict of what changes will do:
-            `randomization={"gain": 0.0}`.
+            For a field that is itself a config, a dict of its changed fields:
+            `randomization={"gain": 0.0}`. `render_mode="rgb_array"` is for video recorders.
 
     Raises:
         UserError: there is no such task or option, a value is out of its range, or a goal is
             missing.
     """
-    env: gym.Env = tasks.make(task, render_mode=render_mode, **options)  # type: ignore[call-overload]
+    if task not in _ENVIRONMENTS:
+        raise UserError(f"unknown task {task!r}; choose from: {', '.join(_ENVIRONMENTS)}")
+    env: gym.Env = _ENVIRONMENTS[task](**options)
     if not for_rl:
         if (touch, reward, goal, normalizer, encoder) != ("picture", "progress", None, None, None):
             raise UserError("touch, reward, goal, normalizer and encoder need for_rl=True")

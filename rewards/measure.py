@@ -1,4 +1,4 @@
-"""Measure every trajectory of a source once: what is broken is skipped, what is measured stays."""
+"""Measure every trajectory of a source; broken ones are skipped, measured ones are not repeated."""
 
 import csv
 import hashlib

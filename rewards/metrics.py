@@ -1,7 +1,8 @@
-"""Metrics of a cost curve d (n,), the distance to a goal at each frame; in the unit of the curve.
+"""Metrics of a cost curve d (n,), the distance to a goal at each frame.
 
-Undefined is None: a curve that does not change has no order. Ties share a rank. A bump counts only
-above the noise, eps = 3 sigma, with sigma measured before the contact.
+"(curve)" marks a quantity in the unit of the curve. Undefined is None: a curve that does not change
+has no order. Ties share a rank. A bump counts only above the noise, eps = 3 sigma, with sigma
+measured before the contact.
 """
 
 from collections.abc import Sequence

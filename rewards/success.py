@@ -56,8 +56,8 @@ def fit_success(costs: Sequence[float], rejected: float = REJECTED) -> SuccessTh
     UserError: too few demonstrations for the bound.
 
     Args:
-        costs: last fused costs, one a demonstration, to goals of the kind that later episodes are
-            measured with.
+        costs: last fused costs, one per demonstration, to the kind of goals that later episodes are
+            measured against.
         rejected: bound on the share of successes that are rejected.
     """
     check_demonstrations(len(costs), rejected)

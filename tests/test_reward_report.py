@@ -211,8 +211,8 @@ def data_of(page: Path) -> dict[str, Any]:
 def pages(episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
     measurement = measure(episodes, tmp_path / "out")
 
-    def write(on_a_page: int) -> Path:
-        monkeypatch.setattr("touchgoal.rewards.report.page.ON_A_PAGE", on_a_page)
+    def write(per_page: int) -> Path:
+        monkeypatch.setattr("touchgoal.rewards.report.page.PER_PAGE", per_page)
         all_facts = [load_facts(path) for path in measurement.records]
         return write_pages(measurement.records, all_facts, tmp_path / "out", ["title\n<b>"])
 

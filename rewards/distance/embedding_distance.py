@@ -4,7 +4,6 @@ All distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over t
 """
 
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -19,18 +18,10 @@ from touchgoal.rewards.distance.parts import (
     smooth_and_fuse,
     soft_minimum,
 )
-from touchgoal.rewards.features.embedded import CameraFeatures, EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.value.value import Value
 
 _ALPHA = 0.5  # share of the way to the line through baseline and sentence
-
-
-@runtime_checkable  # beartype checks arguments in tests
-class ProgressEstimator(Protocol):
-    """A `Value`, without the network library that it needs."""
-
-    def progress(self, cameras: Mapping[str, CameraFeatures]) -> Float[np.ndarray, " n"]:
-        """Return the share of the way at each frame, from that frame alone, in [0, 1]."""
-        ...
 
 
 def compute_distances(
@@ -51,12 +42,12 @@ def compute_curves(
     episode: EmbeddedEpisode,
     goal: EmbeddedGoal,
     normalizer: DistanceNormalizer | None,
-    value: ProgressEstimator | None = None,
+    value: Value | None = None,
     before: Mapping[str, float] | None = None,
 ) -> Curves:
-    """Return the curves of one trajectory to one goal; without a normalizer raw, and none fused.
+    """Return the curves of one trajectory to one goal; raw distances alone without a normalizer.
 
-    `before` are the costs of the parts at the frame before, if the trajectory comes in pieces.
+    `before` holds the costs of the parts at the previous frame, if the trajectory comes in pieces.
     UserError: the normalizer lacks a modality or was fitted for something else.
     """
     raw = compute_distances(episode, goal)
@@ -98,9 +89,9 @@ def text_distances(
 ) -> Float[np.ndarray, "n g"]:
     """Return the distance of each touch to each sentence, mean over the fingertips.
 
-    With a baseline sentence, a touch is first moved half of the way to the line through baseline and
-    sentence, and the distance is half the squared one (VLM-RM with alpha = 0.5): what does not
-    distinguish the two counts less.
+    With a baseline sentence, a touch is first moved halfway to the line through baseline and
+    sentence; the distance is then half the squared one (VLM-RM with alpha = 0.5). What does not
+    distinguish the two sentences so counts less.
     """
     if baseline is None or not len(baseline):
         return 1 - np.mean(touch, axis=0, dtype=np.float64) @ goals.astype(np.float64).T

@@ -5,14 +5,14 @@ of d among successful ends of the same object. 0 is the goal, 1/3 the spread of 
 away. A fingertip part costs its no-contact value until contact is detected, with hysteresis
 (`ContactReader`): before contact only the cameras can lower the fused cost.
 
-    front, wrist  pooled pictures of a camera, called after it
-    wrist_map     the wrist camera at stride 16: where things lie in the hand's frame
+    front, wrist  pooled features of the camera of that name
+    wrist_map     feature map of the wrist camera at stride 16: where objects are in the hand's frame
     object        touch embedding: which object is held
     force         grip force, from the depth of the gel
     centre        where on the fingertips the object is held
     held          whether the fingertips touch
     words         touch against a sentence: the normalised distance, clipped to [0, 1]
-    value         1 - the share of the way that a value sees, whatever the goal
+    value         1 - the progress that a `Value` predicts; it does not depend on the goal
 """
 
 from collections.abc import Mapping
@@ -39,8 +39,8 @@ SMALLEST_UNIT = {
     "centre": 2e-4,  # m
     "held": 1 / 3,  # so that a missing fingertip costs 1
 }
-"""Least unit of each part, about the noise of a camera: some demonstrations end almost alike. Another
-camera has that of `front`."""
+"""Least unit of each part, about the noise of a camera: some demonstrations end almost alike. Other
+cameras have the one of `front`."""
 _SATURATION = 3.0  # units beyond which a part does not count further
 _FORCE_FLOOR = 0.5  # N, below which the depth of a gel reads noise
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
@@ -135,7 +135,7 @@ def part_costs(episode: EmbeddedEpisode, goal: EmbeddedGoal, units: Mapping[str,
     }
     if episode.readings is None or goal.readings is None:
         return costs
-    touching = np.any(episode.readings.touching, axis=0, keepdims=True)[0]
+    touching = np.asarray(episode.readings.touching.any(axis=0))
     wanted = bool(goal.readings.touching.any())
     gated = {k: gate(c, touching, wanted) for k, c in costs.items() if k in TOUCH_PARTS}
     return costs | gated
@@ -144,7 +144,7 @@ def part_costs(episode: EmbeddedEpisode, goal: EmbeddedGoal, units: Mapping[str,
 def gate(
     cost: Float[np.ndarray, " n"], touching: Bool[np.ndarray, " n"], goal_touches: bool
 ) -> Float[np.ndarray, " n"]:
-    """Return a fingertip part's cost, without contact 1, or 0 if the goal has no contact either."""
+    """Return a fingertip part's cost; without contact it is 1, or 0 if the goal is without, too."""
     return np.where(touching, cost, float(goal_touches))
 
 
@@ -153,7 +153,7 @@ def smooth_and_fuse(
 ) -> Costs:
     """Return the smoothed parts and "fused": their mean, or half the value and half that mean.
 
-    `before` has the costs of the frame before, None at the beginning. Empty without parts.
+    `before` has the costs of the previous frame, None at the beginning. Empty without parts.
     """
     last = before or {}
     smoothed = {name: smooth(cost, fps, last.get(name)) for name, cost in parts.items()}
@@ -169,7 +169,7 @@ def smooth_and_fuse(
 def smooth(
     cost: Float[np.ndarray, " n"], fps: float, before: float | None = None
 ) -> Float[np.ndarray, " n"]:
-    """Return exponentially smoothed costs, each from frames up to its own; `before`: the last one."""
+    """Smooth costs exponentially, looking back only; `before` is the smoothed previous cost."""
     keep = np.exp(-1 / (fps * SMOOTHING))
     start = cost[0] if before is None else before
     return lfilter([1 - keep], [1, -keep], cost, zi=[keep * start])[0]

@@ -101,7 +101,7 @@ class EmbeddedEpisode:
 class EmbeddedGoal:
     """Goals of a trajectory as features, one or several (g) for each modality that has any.
 
-    Of several the nearest counts, softly (`soft_minimum`).
+    The nearest of several counts most (`soft_minimum`).
     """
 
     forms: Mapping[str, str]  # the goals as a user writes them, by modality
@@ -109,13 +109,13 @@ class EmbeddedGoal:
     image: Float32[np.ndarray, "g d"] | None = None
     touch: Float32[np.ndarray, "sides g k"] | None = None
     text: Float32[np.ndarray, "g k"] | None = None
-    text_baseline: Float32[np.ndarray, "b k"] | None = None  # of the sentence against it, if any
+    text_baseline: Float32[np.ndarray, "b k"] | None = None  # of the baseline sentence, if any
     cameras: Mapping[str, CameraFeatures] = field(default_factory=dict)
     readings: ContactReadings | None = None
 
 
 def goal_at_every_frame(frames: EmbeddedEpisode) -> EmbeddedGoal:
-    """Return goals of image and touch, one at each frame of these."""
+    """Return an embedding's frames as goals of image and touch."""
     return EmbeddedGoal(
         forms={},
         same_episode=frozenset(),

@@ -245,17 +245,15 @@ class EpisodeEmbedder:
                 ends = SuccessfulEnds.load(spec.path)
             else:
                 wanted = (*own.cameras, *((self.camera,) if self.camera else ()), *own.sides)
-                embedded = [self._embed_end(end, wanted, own.fps) for end in spec.ends()]
-                ends = SuccessfulEnds.of(embedded)
+                keys = tuple(dict.fromkeys(wanted))
+                ends = SuccessfulEnds.of(
+                    [self.embed_episode(e.read(keys), own.fps, str(e)) for e in spec.ends()]
+                )
             self._ends[spec] = ends
         ends = self._ends[spec]
         if (reason := ends.frames.made_with.mismatch(own.made_with)) is not None:
             raise UserError(f"goal '{spec}' does not fit {own.source}: {reason}")
         return ends
-
-    def _embed_end(self, end: EpisodeEnd, keys: Sequence[str], fps: float) -> EmbeddedEpisode:
-        """Return the first frames and the end of an episode, embedded."""
-        return self.embed_episode(end.read(tuple(dict.fromkeys(keys))), fps, str(end))
 
     def _embed_descriptions(
         self, episode: Episode, source: str

@@ -1,4 +1,4 @@
-"""Ends of successful episodes, a goal that can be saved: of several the nearest counts."""
+"""Ends of successful episodes as a goal that can be saved; the nearest one counts most."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ _REMEDY = "write one with touchgoal fit-normalizer"
 class SuccessfulEnds:
     """Embedded last frames of successful episodes."""
 
-    frames: EmbeddedEpisode  # one frame an episode
+    frames: EmbeddedEpisode  # one per episode
     objects: tuple[str, ...]  # object of each; "" if unknown
 
     @classmethod
@@ -65,15 +65,12 @@ class SuccessfulEnds:
 
     def save(self, path: Path) -> None:
         """Write a compressed npz file, atomically."""
-        frames, arrays = self.frames, _Arrays()
-        arrays.add("image", frames.image)
-        arrays.add("touch", frames.touch)
+        frames = self.frames
+        arrays = {"image": frames.image, "touch": frames.touch}
         for key, camera in frames.cameras.items():
-            arrays.add(f"pooled/{key}", camera.pooled)
-            arrays.add(f"map/{key}", camera.map)
+            arrays |= {f"pooled/{key}": camera.pooled, f"map/{key}": camera.map}
         if frames.readings is not None:
-            for name in ("touching", "force", "centre"):
-                arrays.add(name, getattr(frames.readings, name))
+            arrays |= vars(frames.readings)
         about = {
             "objects": self.objects,
             "sides": frames.sides,
@@ -81,8 +78,9 @@ class SuccessfulEnds:
             "made_with": asdict(frames.made_with),
         }
         with atomic_write(path) as file, file.open("wb") as stream:
-            arrays["about"] = np.array(json.dumps(about))
-            np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
+            present = {key: array for key, array in arrays.items() if array is not None}
+            present["about"] = np.array(json.dumps(about))
+            np.savez_compressed(stream, **present)  # pyright: ignore[reportArgumentType]
 
     @classmethod
     def load(cls, path: Path) -> "SuccessfulEnds":
@@ -97,12 +95,6 @@ class SuccessfulEnds:
             return cls(frames, tuple(about["objects"]))
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise UserError(f"{path} is no goal file: {_REMEDY}") from error
-
-
-class _Arrays(dict[str, np.ndarray]):
-    def add(self, name: str, array: np.ndarray | None) -> None:
-        if array is not None:
-            self[name] = array
 
 
 def _frames(

@@ -40,13 +40,13 @@ class CostMeter:
     """
 
     def __init__(self, model: RewardModel, object_name: str = "", rate: float = CONTROL_HZ) -> None:
-        """Prepare for one run, to goals from outside it; without a normalizer, of one modality.
+        """Prepare for one run.
 
-        UserError: a goal that is known only at the end, or raw distances of several modalities.
+        UserError if its goal is known only at its end, or if several modalities have no normalizer.
 
         Args:
             object_name: object of the run, which chooses among the goals; "" if unknown.
-            rate: ticks a second.
+            rate: ticks per second.
         """
         if model.goal.same_episode:
             raise UserError("task.rewards: last and frame:K are not known before the end")

@@ -41,9 +41,10 @@ class TouchReward(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray])
         model = load_reward_model(inputs_of(env), [goal], normalizer="runs/fit/normalizer.json")
         env = TouchReward(env, model)
 
-    The potential form pays the fall of the cost, cost_before - gamma cost, so that holding still
-    pays nothing with gamma 1 and a path is paid by its ends; the state form pays -cost. `info` has
-    the `cost` and the environment's own reward as `task_reward`. An end is not set to zero.
+    The potential form pays the fall of the cost, cost_before - gamma cost: with gamma 1 holding still
+    pays nothing, and the return depends only on the first and the last cost. The state form pays
+    -cost. `info` has the `cost` and the environment's own reward as `task_reward`. The potential of
+    the last state is not set to zero.
     """
 
     def __init__(
@@ -58,8 +59,8 @@ class TouchReward(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray])
         UserError: another sensor or camera than the model's, or a goal inside the episode.
 
         Args:
-            gamma: discount a second of the potential form. An algorithm that discounts by g a step
-                wants g to the power of the steps a second.
+            gamma: discount per second of the potential form. For an algorithm that discounts by g per
+                step it is g to the power of the steps per second.
         """
         super().__init__(env)
         inputs, made_with = inputs_of(env), model.embedder.made_with

@@ -1,6 +1,6 @@
 """All values of all frames in one Parquet table, in the layouts that LeRobot reads.
 
-`frames.parquet` is a table of frame signals: index, episode_index, frame_index and one column a
+`frames.parquet` is a table of frame signals: index, episode_index, frame_index and one column per
 signal, described in the schema's metadata. `touchgoal_progress.parquet` has the column that LeRobot's
 reward-weighted training and its overlay videos read, `progress_sparse`.
 """

@@ -5,12 +5,13 @@ from statistics import mean
 
 from touchgoal.rewards.metrics import auc
 from touchgoal.rewards.report.record import Facts
+from touchgoal.rewards.report.text_table import aligned
 
 _TITLE = "last cost by outcome, goals from other trajectories"
 
 
 def outcome_table(facts: Sequence[Facts]) -> str:
-    """Return a table, its title first, with a row a curve: mean last cost of each outcome, and the AUC.
+    """Return a table, its title first, with a row per curve: mean last cost of each outcome, and the AUC.
 
     The AUC is the share of pairs of a failure and a success in which the failure ends at the higher
     cost, a tie counting half; a dash where one of the two is missing. Trajectories whose goal is a frame
@@ -28,20 +29,9 @@ def outcome_table(facts: Sequence[Facts]) -> str:
         by_outcome = [[end for f, end in last if f.outcome == o] for o in outcomes]
         cells = [f"{mean(ends):.2f}" if ends else "-" for ends in by_outcome]
         failures, successes = ([end for f, end in last if f.success is s] for s in (False, True))
-        rows.append([curve, *cells, _auc(failures, successes)])
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = [
-        f"{row[0]:<{widths[0]}}"
-        + "".join(f"{cell:>{width + 2}}" for cell, width in zip(row[1:], widths[1:], strict=True))
-        for row in rows
-    ]
+        both = failures and successes
+        rows.append([curve, *cells, f"{auc(successes, failures):.2f}" if both else "-"])
     legend = (
         "  AUC       share of (failure, success) pairs in which the failure ends at the higher cost"
     )
-    return "\n".join([_TITLE, *lines, legend])
-
-
-def _auc(failures: Sequence[float], successes: Sequence[float]) -> str:
-    if not failures or not successes:
-        return "-"
-    return f"{auc(successes, failures):.2f}"
+    return "\n".join([_TITLE, *aligned(rows), legend])

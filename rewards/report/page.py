@@ -25,7 +25,7 @@ from touchgoal.rewards.report.thumbnails import last_of
 from touchgoal.runtime.atomic_write import write_file
 
 PAGE = "report.html"
-ON_A_PAGE = 100  # trajectories
+PER_PAGE = 100  # trajectories
 _MOST_POINTS = 600  # of a curve in a page; a longer one is drawn by evenly spaced frames
 _FILES = Path(__file__).parent / "page_files"
 _WORDS = {"source": "trajectory", "object": "object", "outcome": "outcome"}
@@ -40,7 +40,7 @@ def write_pages(
 
     `tables` are printed above the table of trajectories, each with its title as its first line.
     """
-    groups = [range(i, min(i + ON_A_PAGE, len(facts))) for i in range(0, len(facts), ON_A_PAGE)]
+    groups = [range(i, min(i + PER_PAGE, len(facts))) for i in range(0, len(facts), PER_PAGE)]
     names = [PAGE] if len(groups) == 1 else [f"report_{k + 1:03d}.html" for k in range(len(groups))]
     thumbs: list[str] = []
     for name, group in zip(names, groups, strict=True):

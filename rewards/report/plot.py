@@ -21,8 +21,8 @@ _LABEL_GAP = 0.06  # least distance between two curve labels, share of the first
 def draw(curves: Curves, gamma: float) -> Figure:
     """Return a figure of costs, state rewards and potential-based rewards over time.
 
-    The first contact is marked, and the costs that mean something. With parts, the plain distances
-    are left out, and the rewards are those of the fused cost.
+    The first contact and the reference levels are marked. With parts, the plain distances are left
+    out, and the rewards are those of the fused cost.
     """
     costs = curves.costs
     main = main_curve(costs)
@@ -95,7 +95,7 @@ def _frame_axes(axes: Axes, label: str, end: float) -> None:
 
 
 def _frame_costs(axes: Axes, levels: Sequence[tuple[float, str]]) -> None:
-    """Start the cost axis at 0 at the latest, and mark the levels that mean something."""
+    """Include 0 in the cost axis, and mark the reference levels."""
     low, high = axes.get_ylim()
     axes.set_ylim(min(-0.03 * high, low), high)
     if not levels:

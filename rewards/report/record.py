@@ -26,7 +26,7 @@ _COLUMN, _SHEET = "column/", "sheet/"
 
 @dataclass(frozen=True)
 class Facts:
-    """Everything about a measured trajectory but its values a frame and its pictures."""
+    """Everything about a measured trajectory but its values per frame and its pictures."""
 
     name: str  # file name of its reports
     source: str  # name for people
@@ -46,7 +46,7 @@ class Facts:
     measured: dict[str, dict[str, Any]]  # metrics of each cost curve, see CurveMetrics
     peaks: dict[str, list[int]]  # frames of the bumps of each cost curve
     shown: list[int]  # frames that the pictures show
-    columns: list[str]  # names of the values a frame
+    columns: list[str]  # names of the values per frame
 
     def metrics(self) -> dict[str, CurveMetrics]:
         """Return the metrics of each cost curve."""
@@ -58,7 +58,7 @@ class Record:
     """A measured trajectory."""
 
     facts: Facts
-    columns: dict[str, Float[np.ndarray, " n"]]  # values a frame
+    columns: dict[str, Float[np.ndarray, " n"]]  # values per frame
     sheets: dict[str, UInt8[np.ndarray, " bytes"]]  # JPEG of each camera and fingertip
 
     @property
@@ -124,7 +124,7 @@ def record_of(
 
 
 def columns_of(curves: Curves, gamma: float) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return all values a frame: costs, both forms of reward, raw distances."""
+    """Return all values per frame: costs, both forms of reward, raw distances."""
     groups: dict[str, Mapping[str, np.ndarray]] = {
         COST: curves.costs,
         REWARD: curves.rewards,

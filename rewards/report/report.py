@@ -117,7 +117,7 @@ def _rounded(curves: Mapping[str, np.ndarray]) -> dict[str, list[float]]:
 
 
 def curves_csv(curves: Curves, gamma: float = GAMMA) -> str:
-    """Return a CSV with a row a frame.
+    """Return a CSV with a row per frame.
 
     Columns: frame, time (s); for every curve `cost_`, `reward_` (-cost) and `potential_reward_`
     (see `report_json`); `cosine_distance_` of every single modality.

@@ -5,14 +5,18 @@ from statistics import mean, median_low
 
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.report.record import Facts
+from touchgoal.rewards.report.text_table import aligned
 
 COLUMNS = {
     "first": ("start", "median cost of the first 5 frames"),
     "last": ("end", "cost of the last frame"),
-    "half at": ("t_drop_50", "first frame by which half of that fall has happened"),
+    "half at": (
+        "t_drop_50",
+        "first frame by which half of the fall from first to last has happened",
+    ),
     "lag": (
         "contact_lag",
-        "the same in frames after the first contact; negative if the cost fell before",
+        "the same, counted from the first contact; negative if the cost fell before",
     ),
     "mean": ("area", "mean cost of all frames: the earlier it falls, the lower"),
     "bumps": ("peaks", "number of peaks above the noise"),
@@ -42,14 +46,11 @@ def metrics_table(curves: Sequence[Curves] | Sequence[Facts], legend: bool = Tru
     for name in names:
         some = [m[name] for m in metrics if name in m]
         rows.append([name, *(_cell([getattr(m, f) for m in some]) for f, _ in COLUMNS.values())])
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     n = len(curves)
     lines = [f"{n} {'trajectory' if n == 1 else 'trajectories'}; cost: {curves[0].unit}"]
     if n > 1:
         lines.append("costs and correlations are means, frames and counts are medians")
-    for row in rows:
-        cells = (f"{cell:>{width + 2}}" for cell, width in zip(row[1:], widths[1:], strict=True))
-        lines.append(f"{row[0]:<{widths[0]}}" + "".join(cells))
+    lines += aligned(rows)
     if legend:
         lines += [f"  {header:<10}{legend}" for header, (_, legend) in COLUMNS.items()]
         lines.append("  -         undefined: the cost does not fall, or there is no contact")

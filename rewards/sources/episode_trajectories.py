@@ -1,6 +1,6 @@
 """Episodes of a set as trajectories."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -9,51 +9,24 @@ import numpy as np
 
 from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT
 from touchgoal.episodes.faults import find_faults
-from touchgoal.episodes.schema import Episode, MetaValue, is_camera, is_image
+from touchgoal.episodes.schema import Episode, is_camera, is_image
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.rewards.distance.normalizer import scene_of
 from touchgoal.rewards.features.embedder import missing_camera
 from touchgoal.rewards.goals import Inputs
-from touchgoal.rewards.sources.trajectory import Skipped, Source, frames_per_chunk
+from touchgoal.rewards.sources.trajectory import Skipped, Source, Trajectory, frames_per_chunk
 from touchgoal.runtime.errors import UserError
 
 _LOOKED_AT = 8  # episodes whose first frames are checked before any work
 
 
-@dataclass(frozen=True)
-class EpisodeTrajectory:
+@dataclass(frozen=True, eq=False)
+class EpisodeTrajectory(Trajectory):
     """One episode of a set."""
 
     episodes: EpisodeSet
-    index: int
-    offset: int
     keys: tuple[str, ...]  # the features that are read
-
-    @property
-    def name(self) -> str:
-        """See Trajectory."""
-        return f"episode_{self.index:03d}"
-
-    @property
-    def source(self) -> str:
-        """See Trajectory."""
-        return f"{self.episodes.root.name}#{self.index}"
-
-    @property
-    def length(self) -> int:
-        """See Trajectory."""
-        return self.episodes.lengths[self.index]
-
-    @property
-    def fps(self) -> float:
-        """See Trajectory."""
-        return self.episodes.fps
-
-    @property
-    def meta(self) -> Mapping[str, MetaValue]:
-        """See Trajectory."""
-        return self.episodes.meta(self.index)
 
     def checksum(self) -> str:
         """See Trajectory."""
@@ -79,16 +52,17 @@ def open_episodes(root: Path, camera: str, index: Sequence[int], with_touch: boo
     chosen = list(index or range(len(episodes)))
     touch = tuple(key for key in TACTILE if with_touch and key in episodes.features)
     camera = _find_camera(episodes, camera, bool(touch))
-    _check_sensors(episodes, chosen)
     cameras = tuple(key for key in dict.fromkeys((*CAMERAS, camera)) if key in episodes.features)
-    keys = [key for key in (*cameras, *touch, TRUTH_CONTACT) if key in episodes.features]
+    keys = tuple(key for key in (*cameras, *touch, TRUTH_CONTACT) if key in episodes.features)
+    found = _trajectories(episodes, chosen, keys)
+    sensors = {str(t.meta["sensor"]) for t in found if t.meta.get("sensor")}
+    if len(sensors) > 1:
+        raise UserError(f"{root} mixes the sensors {', '.join(sorted(sensors))}: choose --index")
     tasks = {episodes.task(i) for i in chosen}
     if touch:
         seen = {chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)}
         if readable := [i for i in sorted(seen) if _reads(episodes, i, touch)]:
             check_fingertips(episodes, readable)
-    offsets = [0, *accumulate(episodes.lengths)]
-    found = [EpisodeTrajectory(episodes, i, offsets[i], tuple(keys)) for i in chosen]
     faults = find_faults(episodes, chosen, keys)
     faults |= {
         t.index: f"{t.source} has one frame: a curve needs at least 2"
@@ -104,13 +78,34 @@ def open_episodes(root: Path, camera: str, index: Sequence[int], with_touch: boo
         name=shortest.source,
         camera=camera if camera in episodes.features else None,
         sides=touch,
-        sensor=next(iter(_sensors(episodes, chosen)), None),
+        sensor=next(iter(sensors), None),
         scene=scene_of(episodes.features),
         length=shortest.length,
         cameras=cameras,
         task=next(iter(tasks)) if len(tasks) == 1 else "",
     )
     return Source(inputs, sound, broken)
+
+
+def _trajectories(
+    episodes: EpisodeSet, chosen: Sequence[int], keys: tuple[str, ...]
+) -> list[EpisodeTrajectory]:
+    lengths = episodes.lengths
+    offsets = [0, *accumulate(lengths)]
+    return [
+        EpisodeTrajectory(
+            name=f"episode_{i:03d}",
+            source=f"{episodes.root.name}#{i}",
+            index=i,
+            offset=offsets[i],
+            length=lengths[i],
+            fps=episodes.fps,
+            meta=episodes.meta(i),
+            episodes=episodes,
+            keys=keys,
+        )
+        for i in chosen
+    ]
 
 
 def _check_index(episodes: EpisodeSet, index: Sequence[int]) -> None:
@@ -133,18 +128,6 @@ def _find_camera(episodes: EpisodeSet, camera: str, touch: bool) -> str:
         print(f"{episodes.root} has one camera: measuring {cameras[0]}")
         return cameras[0]
     raise UserError(missing_camera(str(episodes.root), camera, cameras))
-
-
-def _check_sensors(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
-    if len(sensors := _sensors(episodes, chosen)) > 1:
-        raise UserError(
-            f"{episodes.root} mixes the sensors {', '.join(sorted(sensors))}: choose --index"
-        )
-
-
-def _sensors(episodes: EpisodeSet, chosen: Sequence[int]) -> set[str]:
-    metas = [episodes.meta(i) for i in chosen]
-    return {str(meta["sensor"]) for meta in metas if meta.get("sensor")}
 
 
 def _reads(episodes: EpisodeSet, i: int, keys: Sequence[str]) -> bool:

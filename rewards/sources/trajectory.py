@@ -1,8 +1,8 @@
 """Trajectories of a source before they are read."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.rewards.goals import Inputs
@@ -11,52 +11,25 @@ _CHUNK_BYTES = 48e6  # decoded frames in a chunk; a few chunks are in memory at 
 _FEWEST_FRAMES = 16  # in a chunk: the first one holds the frames that give the background
 
 
-@runtime_checkable  # beartype checks arguments in tests
-class Trajectory(Protocol):
+@dataclass(frozen=True, eq=False)
+class Trajectory(ABC):
     """A recording that is not read yet."""
 
-    @property
-    def name(self) -> str:
-        """File name of its reports, unique within the source: "episode_003"."""
-        ...
+    name: str  # file name of its reports, unique within the source: "episode_003"
+    source: str  # name for people: "pick#3"
+    index: int  # number within the set or folder
+    offset: int  # number of frames of the set or folder that come before it
+    length: int  # number of frames
+    fps: float  # frames per second
+    meta: Mapping[str, MetaValue]  # facts such as object and outcome, as far as they are recorded
 
-    @property
-    def source(self) -> str:
-        """Name for people: "pick#3"."""
-        ...
-
-    @property
-    def index(self) -> int:
-        """Number within the set or folder."""
-        ...
-
-    @property
-    def offset(self) -> int:
-        """Number of frames of the set or folder that come before it."""
-        ...
-
-    @property
-    def length(self) -> int:
-        """Number of frames."""
-        ...
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        ...
-
-    @property
-    def meta(self) -> Mapping[str, MetaValue]:
-        """Facts such as object and outcome, as far as they are recorded."""
-        ...
-
+    @abstractmethod
     def checksum(self) -> str:
         """Return a text that changes when the recording does."""
-        ...
 
+    @abstractmethod
     def chunks(self) -> Iterator[Episode]:
         """Read consecutive frames. UserError: a file is missing or unreadable."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ if known object and task) says how each one ended.
 
 import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from touchgoal.control.features import (
 from touchgoal.episodes.media import PICTURES, VIDEOS, Clip, in_natural_order, open_clip
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.rewards.goals import Inputs
-from touchgoal.rewards.sources.trajectory import Skipped, Source, frames_per_chunk
+from touchgoal.rewards.sources.trajectory import Skipped, Source, Trajectory, frames_per_chunk
 from touchgoal.runtime.errors import UserError
 
 _ROLES = {
@@ -42,26 +42,11 @@ _FACTS = ("object", "outcome", "task")
 _SAME_RATE = 0.01  # share by which the frame rates of one trajectory may differ
 
 
-@dataclass(frozen=True)
-class VideoTrajectory:
+@dataclass(frozen=True, eq=False)
+class VideoTrajectory(Trajectory):
     """One trajectory of video files or folders of images."""
 
-    name: str
-    index: int
     clips: Mapping[str, Clip]  # by what they show
-    fps: float
-    meta: Mapping[str, MetaValue]
-    offset: int = 0
-
-    @property
-    def source(self) -> str:
-        """See Trajectory."""
-        return self.name
-
-    @property
-    def length(self) -> int:
-        """See Trajectory."""
-        return next(iter(self.clips.values())).length
 
     def checksum(self) -> str:
         """Return sizes and times of the files."""
@@ -92,17 +77,19 @@ def open_videos(path: Path, camera: str, with_touch: bool, fps: float | None) ->
     """
     found = _find(path, camera)
     labels = _read_labels(path if path.is_dir() else path.parent)
-    opened: list[VideoTrajectory] = []
+    offset, opened = 0, list[VideoTrajectory]()
     skipped: list[Skipped] = []
     for i, (name, files) in enumerate(found.items()):
         kept = {k: f for k, f in files.items() if with_touch or k not in TACTILE}
         try:
-            trajectory = _open(name, i, kept, fps)
+            clips = _open_clips(name, kept, fps)
         except UserError as error:
             skipped.append(Skipped(name, str(error)))
-        else:
-            offset = opened[-1].offset + opened[-1].length if opened else 0
-            opened.append(replace(trajectory, offset=offset, meta=labels.get(name, {})))
+            continue
+        first = next(iter(clips.values()))
+        rate, meta = fps or first.fps or CONTROL_HZ, labels.get(name, {})
+        opened.append(VideoTrajectory(name, name, i, offset, first.length, rate, meta, clips))
+        offset += first.length
     if not opened:
         raise UserError(skipped[0].reason)
     keys = list(opened[0].clips)
@@ -130,7 +117,7 @@ def _find(path: Path, camera: str) -> dict[str, dict[str, Path]]:
         name = _split_name(path)[0] or path.parent.name
         return {name: _group(path.parent, camera).get(name, {camera: path})}
     entries = in_natural_order(path.iterdir())
-    if any(e.suffix.lower() in PICTURES for e in entries) or _is_trajectory(path):
+    if any(e.suffix.lower() in PICTURES for e in entries) or _named_by_role(path):
         return {path.resolve().name: _files_of(path, camera)}
     found = _group(path, camera)
     for folder in entries:
@@ -143,24 +130,21 @@ def _find(path: Path, camera: str) -> dict[str, dict[str, Path]]:
 
 def _files_of(folder: Path, camera: str) -> dict[str, Path]:
     """Return the files of one trajectory's folder by what they show; {} if it is none."""
-    if _is_trajectory(folder):
-        return {
-            _ROLES[entry.stem]: entry
-            for entry in in_natural_order(folder.iterdir())
-            if entry.stem in _ROLES and (entry.is_dir() or entry.suffix.lower() in VIDEOS)
-        }
+    if files := _named_by_role(folder):
+        return files
     if any(entry.suffix.lower() in PICTURES for entry in folder.iterdir()):
         return {camera: folder}
     groups = list(_group(folder, camera).values())
     return groups[0] if len(groups) == 1 else {}
 
 
-def _is_trajectory(folder: Path) -> bool:
-    """Whether a file or folder of images in it is named by what it shows alone: front.mp4."""
-    return any(
-        entry.stem in _ROLES and (entry.is_dir() or entry.suffix.lower() in VIDEOS)
-        for entry in folder.iterdir()
-    )
+def _named_by_role(folder: Path) -> dict[str, Path]:
+    """Return the videos and folders of images that are named by what they show alone: front.mp4."""
+    return {
+        _ROLES[entry.stem]: entry
+        for entry in in_natural_order(folder.iterdir())
+        if entry.stem in _ROLES and (entry.is_dir() or entry.suffix.lower() in VIDEOS)
+    }
 
 
 def _group(folder: Path, camera: str) -> dict[str, dict[str, Path]]:
@@ -186,7 +170,7 @@ def _split_name(path: Path) -> tuple[str, str]:
     return path.stem, ""
 
 
-def _open(name: str, index: int, files: Mapping[str, Path], fps: float | None) -> VideoTrajectory:
+def _open_clips(name: str, files: Mapping[str, Path], fps: float | None) -> dict[str, Clip]:
     clips = {key: open_clip(files[key]) for key in (*CAMERAS, *TACTILE) if key in files}
     if not clips:
         raise UserError(f"{name} has nothing to measure: give a camera's video")
@@ -203,7 +187,7 @@ def _open(name: str, index: int, files: Mapping[str, Path], fps: float | None) -
             raise UserError(f"{clip.path} and {first.path} have different frame rates")
     if fps is not None and first.fps is not None:
         raise UserError(f"{first.path} states its own frame rate: leave --fps out")
-    return VideoTrajectory(name, index, clips, fps or first.fps or CONTROL_HZ, {})
+    return clips
 
 
 def _read_labels(folder: Path) -> dict[str, dict[str, MetaValue]]:

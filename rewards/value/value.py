@@ -1,7 +1,7 @@
-"""Value of a task: how far along its way a picture is, learnt from successful episodes alone.
+"""Value of a task: its progress as seen in one image, learned from successful episodes alone.
 
 Attention pooling with 4 heads over the maps of all cameras (stride 16, from a frozen tower) and a
-linear read-out, regressed on t / T; the mean of three seeds. It fills the way between contact and
+linear read-out, regressed on t / T; the mean of three seeds. It tells progress between contact and
 goal, where distances to a goal say little. It looks at one frame at a time and does not read the
 goal: it holds for the task, cameras and towers that it was fitted to, and is refused elsewhere.
 """
@@ -29,7 +29,7 @@ _CHUNK = 256  # frames in float32 at once
 class ValueConfig:
     """Task, cameras and image network that a value was fitted to."""
 
-    task: str  # see `task_of`
+    task: str  # see `Inputs.fitted_task`
     cameras: tuple[str, ...]  # keys, in the order of the maps
     towers: str  # `EmbeddingSource.towers`
     shape: tuple[int, int, int]  # of a map: channels, rows, columns
@@ -48,7 +48,7 @@ class ValueHead(nn.Module):
         self.read = nn.Linear(cameras * _HEADS * channels, 1)
 
     def forward(self, maps: Float[Tensor, "n cameras c yx"]) -> Float[Tensor, " n"]:
-        """Return the share of the way, about 0 to 1."""
+        """Return the predicted progress, about 0 to 1."""
         scores = torch.einsum("khc,nkcp->nkhp", self.query, maps) + self.place
         pooled = torch.einsum("nkhp,nkcp->nkhc", scores.softmax(-1), maps)
         return self.read(pooled.flatten(1))[:, 0]
@@ -69,13 +69,13 @@ class Value(nn.Module):
         self.heads = nn.ModuleList(ValueHead(config) for _ in range(config.seeds))
 
     def forward(self, maps: Float[Tensor, "n cameras c yx"]) -> Float[Tensor, "seeds n"]:
-        """Return each head's share of the way."""
+        """Return each head's prediction."""
         standardised = (maps - self.mean) / self.spread
         return torch.stack([head(standardised) for head in self.heads])
 
     @torch.no_grad()
     def progress(self, cameras: Mapping[str, CameraFeatures]) -> Float[np.ndarray, " n"]:
-        """Return the share of the way at each frame, from that frame alone, in [0, 1]."""
+        """Return the predicted progress at each frame, from that frame alone, in [0, 1]."""
         maps = stacked_maps(cameras, self.config.cameras)
         chunks = [self(torch.from_numpy(maps[i : i + _CHUNK])) for i in range(0, len(maps), _CHUNK)]
         return torch.cat([c.mean(0) for c in chunks]).clamp(0, 1).numpy().astype(np.float64)

@@ -118,7 +118,7 @@ function drawChart() {
       make("path", { d: `M${x} ${y}l-4.5 -7h9z`, class: "peak", style: `fill:${color};stroke:none` }, chart);
     }
   }
-  drawLegend(s.shown);
+  drawLegend();
 }
 
 function drawLegend() {
