@@ -34,7 +34,7 @@ from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop
 from touchgoal.control.deployment.realtime import RealTimeActor
 from touchgoal.control.deployment.session import Session
 from touchgoal.control.features import Observation
-from touchgoal.control.interfaces import Actor, DriverError
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.episodes.format.repair import validate
 from touchgoal.episodes.schema import Episode
@@ -49,7 +49,7 @@ from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """Does a deployment survive every fault, on the twin through the makers' client libraries?"""
+    """Options of benchmark faults."""
 
     faults: tuple[str, ...] = ()
     """Names of faults to try, as the table has them; default: all."""
@@ -248,7 +248,7 @@ def _deploy(
         if case.policy == "outwards":
             counts = result.log.limit_counts.items()
             message += "; clamped: " + ", ".join(f"{name} {n}" for name, n in counts)
-    except (DriverError, UserError) as error:  # nothing has moved
+    except UserError as error:  # nothing has moved
         message = f"it did not begin: {error}"
     resource.setrlimit(resource.RLIMIT_FSIZE, (_UNLIMITED, _UNLIMITED))
     report.write_text(f"{late}\n{message}")

@@ -1,7 +1,7 @@
 """Success and force under changes that training has not shown, one at a time.
 
-A change is at a policy's cost alone: the expert and the classical follower run under the same ones
-with `--policy expert` and `--policy follower`.
+To see whether a change is hard for any controller, run the expert or the classical follower under
+it: `--policy expert`, `--policy follower`.
 """
 
 from dataclasses import replace

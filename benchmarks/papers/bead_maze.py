@@ -19,6 +19,7 @@ from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.features import Observation
 from touchgoal.encoders.backbones.sparsh import Method
 from touchgoal.encoders.pretrained import ENCODER_FORMAT
+from touchgoal.encoders.probes.bootstrap import percentile_interval
 from touchgoal.episodes.recording import Actor, EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
@@ -40,6 +41,8 @@ from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.scene.wires import HELD_OUT, Wire, choose
+
+_DRAWS = 5000  # of the bootstrap
 
 
 @checked_dataclass
@@ -202,18 +205,16 @@ def _closed_table(results: dict[str, list[Trial]]) -> str:
     return "\n".join(lines)
 
 
-def bootstrap(values: list[tuple[str, float]], draws: int = 5000) -> tuple[float, float]:
+def bootstrap(values: list[tuple[str, float]]) -> tuple[float, float]:
     """Return the 95 % interval of the mean: wires are drawn, then training seeds within each."""
     rng = np.random.default_rng(0)
     groups: dict[str, list[float]] = {}
     for name, value in values:
         groups.setdefault(name, []).append(value)
     rows = np.array(list(groups.values()))  # wires x seeds: every seed ran on every wire
-    wires = rng.integers(len(rows), size=(draws, len(rows), 1))
-    seeds = rng.integers(rows.shape[1], size=(draws, 1, rows.shape[1]))
-    means = rows[wires, seeds].mean((1, 2))
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(low), float(high)
+    wires = rng.integers(len(rows), size=(_DRAWS, len(rows), 1))
+    seeds = rng.integers(rows.shape[1], size=(_DRAWS, 1, rows.shape[1]))
+    return percentile_interval(rows[wires, seeds].mean((1, 2)))
 
 
 def _open_loop(

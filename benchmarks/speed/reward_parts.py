@@ -39,5 +39,5 @@ def time_parts(repeats: int) -> dict[str, float]:
 
 def parts_table(times: dict[str, float]) -> str:
     """Return the times as text."""
-    lines = ["parts of a reward, ms a frame (an embedded touch: the tick above):"]
+    lines = ["parts of a reward, ms per frame (an embedded touch: the tick above):"]
     return "\n".join([*lines, *(f"  {name:<42}{ms:>8.2f}" for name, ms in times.items())])

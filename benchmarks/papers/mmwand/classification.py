@@ -1,6 +1,6 @@
 """Which object is it? MMWand's Table II on wand touches: image, touch and both, on frozen embeddings.
 
-A linear probe and the nearest neighbour on what frozen networks give; on raw pixels, too.
+A linear probe and the nearest neighbour, on frozen embeddings and on raw pixels.
 """
 
 from collections.abc import Callable

@@ -21,7 +21,7 @@ _SMALL = (40, 30)  # px of the pictures that pixels are compared in
 
 @dataclass(frozen=True, eq=False)
 class EmbeddedSet:
-    """n touches of k objects, as the frozen networks give them."""
+    """n touches of k objects, embedded by frozen networks."""
 
     names: tuple[str, ...]  # objects, sorted
     sensor: str  # of the touches

@@ -110,7 +110,7 @@ def _shifted(
 
 
 class _Classifier(nn.Module):
-    """A network a modality, and a linear layer over all their features."""
+    """A network per modality, and a linear layer over all their features."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Grasped objects named by the sentences on them: an encoder's own words on episodes it never saw.
+"""Grasped objects named by sentences about them, by an encoder with words, on unseen episodes.
 
 A touch gets the object whose sentences are nearest on average. Among fewer candidates than all, the
 share of hits is the expected one over all choices of the others.

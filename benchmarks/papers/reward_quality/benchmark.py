@@ -1,7 +1,7 @@
 """Do last costs and curves tell outcomes apart, on objects held out from every fit?
 
-Simulated successes, poor successes and thirteen kinds of failure, in two scenes: goal elsewhere in
-each episode, and one place with one grip force. Goals are the ends of other successes with the
+Simulated successes, poor successes and thirteen kinds of failure, in two scenes: places and grip
+force drawn anew for each episode, or the same in all. Goals are the ends of other successes with the
 object that was asked for.
 """
 
@@ -43,8 +43,8 @@ from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig
 
 TRUE_KINDS = tuple(kind for kind in KINDS if kind != "overgripped")
-"""Kinds whose mean is judged. 40 N cannot be recognised where the demonstrations differ in force; the part
-"force" has a line of its own."""
+"""Kinds whose mean is judged. A grip of 40 N cannot be recognised where the demonstrations differ in
+force."""
 _ON_DIAGONAL = 8  # objects
 _AUDITED = ("success", "drop", "wrong_object")
 

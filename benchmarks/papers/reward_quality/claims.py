@@ -9,12 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from touchgoal.benchmarks.papers.reward_quality.measures import Judged, mean_interval
+from touchgoal.benchmarks.papers.reward_quality.measures import Judged
+from touchgoal.encoders.probes.bootstrap import mean_interval
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
 
 _WITHIN = 0.15  # s, three frames at 20 Hz
+_DRAWS = 10_000
 _PAPER = ("image", "tactile", "image+tactile")
 
 
@@ -126,12 +128,12 @@ def _verdict_of_mean(values: Sequence[float]) -> str:
     """Return the verdict on a mean that is claimed to be positive."""
     if not values:
         return "unsure"
-    low, high = mean_interval(values)
+    low, high = mean_interval(values, _DRAWS)
     return "holds" if low > 0 else "fails" if high < 0 else "unsure"
 
 
 def _interval(values: Sequence[float]) -> str:
     if not values:
         return "none"
-    low, high = mean_interval(values)
+    low, high = mean_interval(values, _DRAWS)
     return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}]"

@@ -1,4 +1,4 @@
-"""Embedding of recorded episodes on all cores, each kept in a file, so that a run can go on."""
+"""Embedding of recorded episodes on all cores, each kept in a file, so that an interrupted run continues."""
 
 import pickle
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ class EmbeddedFiles:
 
     folder: Path
     encoder: str
-    every: int = 1  # frames are embedded, the last one among them
+    every: int = 1  # every n-th frame is embedded, the last one included
 
     def path(self, recorded: Recorded) -> Path:
         """Return the file of an episode."""

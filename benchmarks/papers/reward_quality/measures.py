@@ -114,13 +114,6 @@ def diagonal(costs: Float[np.ndarray, "goals trajectories"]) -> tuple[float, flo
     return float(np.mean(others - own)), float(nearest.mean())
 
 
-def mean_interval(values: Sequence[float], draws: int = 10_000) -> tuple[float, float]:
-    """Return the 95 % percentile interval of a mean over episodes."""
-    rows = np.random.default_rng(0).integers(len(values), size=(draws, len(values)))
-    low, high = np.quantile(np.asarray(values)[rows].mean(axis=1), (0.025, 0.975))
-    return float(low), float(high)
-
-
 def _share(right: Float[np.ndarray, " k"], pairs: Float[np.ndarray, " k"]) -> Estimate:
     return _estimate(right.sum(), pairs.sum(), _drawn() @ right, _drawn() @ pairs)
 

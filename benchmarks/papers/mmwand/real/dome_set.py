@@ -1,4 +1,4 @@
-"""Touches of a grey dome and views of the same objects, as frozen networks give them."""
+"""Touches of a grey dome and views of the same objects, embedded by frozen networks."""
 
 import hashlib
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ INPUTS = (SHIPPED, RANDOM, PIXELS, OUTSIDE)
 """Touch embeddings. The last has no touch in it: what it finds comes from the session's light."""
 DomeSplit = Literal["press", "object"]
 
-# network input: side, px; batch size; counts per count of change
+# network input: side, px; batch size; its counts per count of change in the image
 _SIDE, _BATCH, _CONTRAST = 192, 32, 2.0
 _SMALL = 28  # px of the pictures that pixels are compared in
 

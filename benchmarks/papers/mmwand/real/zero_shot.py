@@ -19,6 +19,7 @@ from touchgoal.benchmarks.papers.mmwand.grasped_objects import run_grasped_objec
 from touchgoal.benchmarks.papers.mmwand.other_set import run_other_set
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.probes.bootstrap import mean_interval
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
@@ -37,7 +38,7 @@ SENTENCES = {
     "steel": ("hard, smooth polished steel", "a hard object with a sleek metal surface"),
     "wood": ("hard wood with a fine grain", "a firm object with shallow lines along the grain"),
 }
-"""Sentences on the common feel of each material; none was chosen by its score."""
+"""Sentences about the usual feel of each material; none was chosen by its score."""
 _BOOTSTRAPS = 1000
 
 
@@ -49,7 +50,7 @@ class Config(BenchmarkOptions):
     """Folder of ObjectFolder Real, with objects.csv and touch/; episodes of `collect-demos`; or touches of
     the wand recorded with another sensor than those of --other."""
     other: Path | None = None
-    """Touches of the wand to train on as well: who trains on one sensor is judged on the other."""
+    """Touches of the wand with another sensor: heads trained on either set are judged on --data."""
     encoders: tuple[str, ...] = ("gelsight_mini",)
     """Touch encoders: names or folders. On ObjectFolder Real they need words of their own; on touches
     of the wand heads are trained."""
@@ -94,12 +95,10 @@ def run(config: Config) -> dict[str, Any]:
 
 def _judge(scores: Float[np.ndarray, "n c"], truth: np.ndarray) -> dict[str, Any]:
     hit = scores.argmax(1) == truth
-    drawn = np.random.default_rng(0).integers(len(hit), size=(_BOOTSTRAPS, len(hit)))
-    low, high = np.percentile(hit[drawn].mean(1), [2.5, 97.5])
     recall = [hit[truth == k].mean() for k in np.unique(truth)]
     return {
         "accuracy": float(hit.mean()),
-        "interval": [float(low), float(high)],
+        "interval": list(mean_interval(hit.astype(float), _BOOTSTRAPS)),
         "balanced": float(np.mean(recall)),
     }
 
