@@ -4,6 +4,7 @@ A single sensor is the left fingertip; the right one then has no images, and its
 """
 
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -50,8 +51,7 @@ def record_bench(
     low, high = config.load
     loads = f"{low:g} to {high:g} N{', no relief' * (not config.shear_relief)}"
     rig = f"{config.sensor}, {'+'.join(shapes.get(what, (what,)))}, {loads}, seed {config.seed}"
-    writer = EpisodeWriter(root, fps=FPS)
-    try:
+    with closing(EpisodeWriter(root, fps=FPS)) as writer:
         if len(writer) and (other := EpisodeSet(root).meta(0).get(_RIG)) != rig:
             raise UserError(
                 f"{root} holds recordings of another rig ({other}), not {rig}: give another folder"
@@ -62,8 +62,6 @@ def record_bench(
                 made = pool.map(partial(_encoded, what, config, rig), missing)
                 for episode in track(made, root.name, "recording", total=len(missing)):
                     writer.append(episode)
-    finally:
-        writer.close()
     return EpisodeSet(root)
 
 

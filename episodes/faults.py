@@ -1,4 +1,4 @@
-"""Faults of recordings in sets that touchgoal did not write: found before work, named, left out."""
+"""Faults in sets that touchgoal did not write: faulty episodes are named and left out before any work."""
 
 import sys
 from collections.abc import Sequence

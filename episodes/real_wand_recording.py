@@ -58,7 +58,7 @@ def record_real_touches(
         counts = _counts(before, name)
         visit = Visit(origin, sensor.name, name, descriptions, gel, number)
         recorder = WandRecorder(sensor, first, counts)
-        with closing(_connected(config)) as wand, stop_on_request() as stopped:
+        with closing(connect_wand(config)) as wand, stop_on_request() as stopped:
             check_untouched(wand.gel.read().image, sensor, "the picture of the wand's gel")
             _Session(writer, visit, recorder, wand).run(stopped, count)
     return EpisodeSet(root) if len(writer) else None
@@ -131,13 +131,6 @@ class _StatusLine:
 
     def _write(self, text: str, end: str) -> None:
         print(f"\r{text:<{_WIDTH}}" if self._terminal else text, end=end, flush=True)
-
-
-def _connected(config: WandConfig) -> Wand:
-    try:
-        return connect_wand(config)
-    except DriverError as error:
-        raise UserError(str(error)) from error
 
 
 def _continued(

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -216,8 +217,8 @@ def collect(
     if not specs:
         raise UserError("nothing to collect: ask for at least one episode")
     metas, failures = [], Counter[str]()
-    writer = EpisodeWriter(root, fps=config.control_hz)  # refuses a second recorder at once
-    try:
+    # the writer refuses a second recorder at once
+    with closing(EpisodeWriter(root, fps=config.control_hz)) as writer:
         check_fits(writer, config)
         with (
             one_core_workers(workers) as pool,
@@ -232,8 +233,6 @@ def collect(
                 bar.update()
                 if len(metas) == failures.total() == max_failures:
                     raise NoSuccessError(f"stopped: {_count(len(metas), failures)}")
-    finally:
-        writer.close()
     return metas
 
 

@@ -44,7 +44,7 @@ class Episode:
     """One recorded attempt at a task.
 
     Attributes:
-        frames: Key of `FEATURES` -> array (T, ...) in the key's dtype, one row a frame. Images are
+        frames: Key of `FEATURES` -> array (T, ...) in the key's dtype, one row per frame. Images are
             uint8 RGB (T, h, w, 3). Within a set, image sizes and the arm's number of joints are equal.
         task: Instruction in words.
         meta: Facts about the whole episode, such as object, seed and outcome; the same keys with the
@@ -101,7 +101,7 @@ def _check_key(features: dict[str, Feature], key: str, values: np.ndarray) -> No
     if is_image(key):
         _check_image_shape(key, values.shape)
     elif values.shape[1:] != feature.shape:
-        raise UserError(f"{key} has shape {values.shape[1:]} a frame, not {feature.shape}")
+        raise UserError(f"{key} has shape {values.shape[1:]} per frame, not {feature.shape}")
     elif not np.isfinite(values).all():
         frame = int(np.argwhere(~np.isfinite(values))[0][0])
         raise UserError(f"{key} is not finite at frame {frame}: leave out what was not measured")

@@ -108,7 +108,7 @@ class EpisodeWriter:
         """Raise UserError, before any work, if episodes to come would not fit an existing set.
 
         Args:
-            shapes: Shape of every observation and of the action, a frame.
+            shapes: Shape of every observation and of the action at one frame.
             task: Name of the task, as in the meta of episodes.
         """
         if self._metadata is not None:

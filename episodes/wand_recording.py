@@ -5,8 +5,9 @@ round visits every object once, with one gel on the wand; the next round has ano
 an episode.
 """
 
-from collections.abc import Iterator
+from contextlib import closing
 from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -44,8 +45,7 @@ def record_touches(root: Path, sensor: str, seed: int, count: int, workers: int)
         UserError: the folder holds another set, or cannot be written to.
     """
     config = f"{sensor}, seed {seed}"
-    writer = EpisodeWriter(root, fps=FPS)
-    try:
+    with closing(EpisodeWriter(root, fps=FPS)) as writer:
         have = len(writer)
         if have and (other := EpisodeSet(root).meta(0).get(SET)) != config:
             raise UserError(
@@ -55,24 +55,13 @@ def record_touches(root: Path, sensor: str, seed: int, count: int, workers: int)
             visits = range(have // TOUCHES_A_VISIT, -(-count // TOUCHES_A_VISIT))
             with one_core_workers(workers) as pool:
                 made = pool.map(partial(_visit, sensor, seed), visits)
-                bar = track(_touches(made, visits, have, count), "touches", "touch", count - have)
-                for episode in bar:
+                first = have - visits.start * TOUCHES_A_VISIT
+                new = islice(chain.from_iterable(made), first, first + count - have)
+                for episode in track(new, "touches", "touch", count - have):
                     writer.append(episode)
                     if wear := episode.description.meta["gel_wear"]:
                         print(f"touch {len(writer) - 1}: the gel looks {wear}: take a new one")
-    finally:
-        writer.close()
     return EpisodeSet(root)
-
-
-def _touches(
-    made: Iterator[list[EncodedEpisode]], visits: range, have: int, count: int
-) -> Iterator[EncodedEpisode]:
-    """Yield the touches from `have` to `count` of these visits."""
-    for visit, episodes in zip(visits, made, strict=True):
-        for i, episode in enumerate(episodes, visit * TOUCHES_A_VISIT):
-            if have <= i < count:
-                yield episode
 
 
 def _visit(sensor: str, seed: int, number: int) -> list[EncodedEpisode]:

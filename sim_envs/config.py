@@ -121,7 +121,7 @@ class SceneConfig:
     arm: Literal["fr3", "ur5e"] = "fr3"
     """Arm that carries the hand."""
     meshes: Annotated[Literal["fast", "full"], RARE] = "fast"
-    """Meshes of the arm in camera images: collision meshes (fast: 2,500 triangles, 1 ms a frame in
+    """Meshes of the arm in camera images: collision meshes (fast: 2,500 triangles, 1 ms per frame in
     software OpenGL) or visual meshes (full: 242,000 triangles, 30 ms)."""
     timestep: Annotated[Positive, RARE] = 1e-3
     """Time step of the physics, s; it must divide 2 ms."""

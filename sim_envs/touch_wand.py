@@ -65,7 +65,7 @@ class Touch(WandTouch):
 
 
 class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
-    """One object on a bench, touched once a step.
+    """One object on a bench, touched once per step.
 
     ## Action space
 

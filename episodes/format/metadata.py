@@ -31,7 +31,7 @@ class SetMetadata:
     features: dict[str, dict[str, Any]]  # as in info.json
     tasks: tuple[str, ...] = ()  # all instructions; the position is the task_index
     stats: dict[str, Stats] | None = None  # statistics over all frames by key
-    episodes: pa.Table | None = None  # meta/episodes, a row an episode; None before the first
+    episodes: pa.Table | None = None  # meta/episodes, a row per episode; None before the first
 
     @property
     def n_episodes(self) -> int:
@@ -102,7 +102,7 @@ class SetMetadata:
     def check_fits(self, root: Path, shapes: Mapping[str, tuple[int, ...]], task: str) -> None:
         """Raise UserError if episodes to come would not fit the set in `root`.
 
-        `shapes` are of every observation and of the action, a frame; `task` is its name in meta.
+        `shapes` are those of every observation and of the action at one frame; `task` is its name in meta.
         """
         there = {
             key: tuple(feature["shape"])

@@ -1,7 +1,7 @@
 """Grasps with a measured force: the layout of EstimateModulus (MIT, arXiv 2407.15304).
 
 A folder holds `grasps.csv` (trial, object), and for each trial `TRIAL.avi` (a fingertip's raw images)
-and `TRIAL.csv` (force_newtons, gripper_width_m; one row a frame).
+and `TRIAL.csv` (force_newtons, gripper_width_m; one row per frame).
 """
 
 import csv

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from touchgoal.control import features as ft
 from touchgoal.sim_envs.config import Outcome
@@ -58,7 +59,9 @@ def read_truth(frames: Mapping[str, np.ndarray]) -> Truth:
     """Return the ground truth of a recorded episode of pick-place."""
     place, start = frames[ft.TRUTH_OBJECT_POSE][:, :3], frames[ft.TRUTH_START]
     tcp = frames[ft.TCP_POSE]
-    offset = np.einsum("nij,ni->nj", _rotations(tcp[:, 3:]), place - tcp[:, :3])
+    offset = Rotation.from_quat(tcp[:, 3:], scalar_first=True).apply(
+        place - tcp[:, :3], inverse=True
+    )
     return Truth(
         touched=np.asarray(frames[ft.TRUTH_CONTACT].any(axis=1)),
         height=place[:, 2] - start[:, 2],
@@ -98,14 +101,3 @@ _CHECKS: dict[Outcome, Callable[[Truth], bool | np.bool_]] = {
 
 def _within(values: Float[np.ndarray, " k"], bounds: tuple[float, float]) -> bool:
     return bool(((bounds[0] < values) & (values < bounds[1])).all())
-
-
-def _rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return rotation matrices of unit quaternions (wxyz)."""
-    w, x, y, z = quaternions.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)

@@ -6,6 +6,7 @@ from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import fingers_across, rotation_matrix, rotation_vector
 from touchgoal.sim_envs.bead_maze import BeadMaze
 
+_SPEED = 0.025  # m/s along the wire
 _RETURN = 5.8  # 1/s: rate at which a distance to the course is taken back, a quarter at 20 Hz
 _FASTEST = 0.02  # m/s (or, times _LEVER, rad/s) at which it comes back from far away
 _LEAD = 0.006  # m that the commanded bead may be ahead of the real one: more is a jam
@@ -14,15 +15,14 @@ _LEVER = 0.02  # m by which a turn counts as a displacement: the size of the bea
 
 
 class BeadMazeExpert:
-    """Leads the bead along the wire at `speed` m/s, the hand turned with the wire.
+    """Leads the bead along the wire, the hand turned with the wire.
 
     It acts on the commanded pose, so that the arm's compliance does not add up; a bead that slipped
-    in
-    the hand is led from where it is.
+    in the hand is led from where it is.
     """
 
-    def __init__(self, env: BeadMaze, speed: float = 0.025) -> None:
-        self._env, self._speed = env, speed
+    def __init__(self, env: BeadMaze) -> None:
+        self._env = env
 
     def act(self, observation: Observation) -> np.ndarray:
         """Return the action for the next tick; the observation is not used."""
@@ -37,7 +37,7 @@ class BeadMazeExpert:
         off = bead - point
         turned = rotation_vector(fingers_across(tangent).T @ R)
         deviation = max(float(np.linalg.norm(off)), _LEVER * float(np.linalg.norm(turned)))
-        ahead = self._speed * tick * max(0.0, 1 - deviation / _SLOW)
+        ahead = _SPEED * tick * max(0.0, 1 - deviation / _SLOW)
         left = max(np.exp(-_RETURN * tick), 1 - _FASTEST * tick / max(deviation, 1e-9))
         point, tangent = env.wire.at(min(s + ahead, env.arc_length + _LEAD))
         R = fingers_across(tangent) @ rotation_matrix(left * turned)

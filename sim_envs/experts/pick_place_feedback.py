@@ -34,7 +34,7 @@ _TURN = 1.0  # rad/s
 class FeedbackExpert:
     """Picks and places from any state of arm and object.
 
-    It follows a funnel over the object, then over the goal: the farther beside, the higher. It acts
+    It follows a funnel over the object, then over the goal: the farther to the side, the higher. It acts
     on the start of the episode and the sensed state of this tick and the last, as a policy can. It
     yields to contact, does not follow a displaced object, and never lets go.
     """

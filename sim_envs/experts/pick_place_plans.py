@@ -89,7 +89,7 @@ def _pick_and_place(
 
 
 def _never_touch(env: PickPlace) -> Plan:
-    # Closed on air the pads would touch each other, which is no absence of touch.
+    # Closed on air the pads would touch each other, which would count as touch.
     return _pick_and_place(env, grasp_shift=(0, 0, 0.08), closed=0.03)
 
 

@@ -160,7 +160,7 @@ class GelMotion:
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _draw(image, columns, centres, radius, darkness):
-    h, w = image.shape  # three channels a pixel
+    h, w = image.shape  # three channels per pixel
     half, one, zero = np.float32(0.5), np.float32(1.0), np.float32(0.0)
     reach = radius + one
     scale = half / radius
