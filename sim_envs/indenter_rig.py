@@ -99,7 +99,7 @@ def shear_force(
 def _draw_path(
     config: RigConfig, sensor: SensorModel, friction: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Draw load (N) and way (m) by frame, where the probe touches (m), direction of the slide."""
+    """Draw a stroke: load (N) and distance (m) by frame, first place (m), direction."""
     load = rng.uniform(*config.load)
     pressing, sliding = int(rng.integers(*_PRESS_FRAMES)), int(rng.integers(*_SLIDE_FRAMES))
     held = friction * load / sensor.shear_stiffness

@@ -188,5 +188,5 @@ def test_bad_requests_say_what_to_do(maze: BeadMaze) -> None:
         find(next(f"roller-{i}" for i in range(100) if wires.make("roller", i) is None))
     with pytest.raises(UserError, match="BeadMazeReset has no option 'bead'; there are: wire"):
         maze.reset(options={"bead": "cube"})
-    with pytest.raises(UserError, match="there are 20 validation wires a family"):
+    with pytest.raises(UserError, match="there are 20 validation wires per family"):
         choose("validation", 100)

@@ -61,8 +61,7 @@ def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> di
     for grasp in track(grasps, "reading", "grasp"):
         frames = grasp.frames()
         force = grasp.force[: len(frames)]
-        # A steady load cell means an open hand, and shows its offset; otherwise the hand is already
-        # closing.
+        # A steady load cell means an open hand, and shows its offset; else the hand is closing.
         open_hand = float(np.ptp(force[:_FIRST])) < _STEADY
         if open_hand:
             force = force - np.median(force[:_FIRST])

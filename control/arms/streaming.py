@@ -33,8 +33,7 @@ class ArmConfig:
     # hz, rate: of the incoming commands and of the outgoing stream, Hz
     hz: float
     rate: float
-    # s without news of the controller after which it is lost; a simulator on a loaded machine needs
-    # more
+    # s without news after which the controller is lost; a loaded simulator needs more
     state_timeout: float
     lock_step: bool = False  # the twin advances only when `advance` is called
 

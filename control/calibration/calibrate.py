@@ -44,8 +44,7 @@ class FittedCalibration:
     # of the fitted presses, m; unknown ones are fitted, but pictures determine them poorly
     ball_radius: Float[np.ndarray, " n"]
     varies_over_image: bool  # whether the response varies; not if all presses lie in one place
-    # label_offset, label_slope: true centre x, centre y and radius (px) are about offset + slope x
-    # label
+    # x, y and radius of the true circle (px) are about label_offset + label_slope * label
     label_offset: Circle
     label_slope: Circle
 

@@ -33,8 +33,7 @@ _JPEG = b"\xff\xd8"  # what a JPEG begins with
 class VideoConfig:
     """Source of pictures and how to read it."""
 
-    # index of a camera (`0`), a device (`/dev/video2`) or the address of an MJPEG stream
-    # (`http://...`)
+    # index of a camera (`0`), device (`/dev/video2`) or address of an MJPEG stream (`http://...`)
     source: str
     size: tuple[int, int] | None = None  # (width, height) to request; None: the camera's own
     rate: float = 25.0  # Hz; requested from a camera, and expected by `problem`
@@ -46,8 +45,7 @@ class VideoConfig:
     # s after which an identical picture, or part of one, counts as old; infinity for rendered
     # pictures, which lack the noise of real ones
     frozen_after: float = 0.5
-    # more identical pictures in a row than this are needed, too: a lock-step twin's time is not wall
-    # time
+    # identical pictures in a row that it also takes, for a lock-step twin: its time is not the clock's
     frozen_pictures: int = 0
     gel: bool = False  # a fingertip's: smooth but for its dots, so broken pictures show
     dots: float = 0.0  # diameter of the printed dots as a share of the picture's diagonal; 0: none

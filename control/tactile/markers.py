@@ -182,8 +182,7 @@ def _ordered(spots: Spots, pitch: float) -> Int[np.ndarray, "n 2"]:
     distance = np.linalg.norm(apart, axis=-1)
     close = np.abs(distance - pitch) < 0.25 * pitch
     along = np.arctan2(apart[close][:, 1], apart[close][:, 0])
-    # Lattice steps point four ways, a right angle apart: four times their angle is the same for
-    # all.
+    # Steps on a lattice differ by right angles, so four times their angle is the same for all.
     angle = np.angle(np.exp(4j * along).sum()) / 4
     step = float(np.median(distance[close])) if close.any() else pitch
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])

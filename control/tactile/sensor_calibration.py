@@ -3,12 +3,11 @@
 A gel surface h(x, y), m into the gel (`gel.deform`), has slopes gx = dh/dx, gy = dh/dy by central
 differences and the unit normal's image-plane part (nx, ny) = -(gx, gy) / sqrt(1 + gx^2 + gy^2).
 With the ten features f_k of `shape_features`, position p = (1, u, v) or (1, u, v, u^2, v^2), u and v
-from -1 to 1 across columns and rows, and the shadow depths s_l of `gel.shadow_depth`, channel c
-shows
+from -1 to 1 across columns and rows, and shadow depths s_l of `gel.shadow_depth`, channel c shows
 
     I_c = background_c + noise + gain_c (
-        sum over k, m of response[c,k,m] f_k p_m  +  sum over l of shadow[c,l] s_l / (s_l +
-        penumbra)
+        sum over k, m of response[c,k,m] f_k p_m
+        + sum over l of shadow[c,l] s_l / (s_l + penumbra)
     )
 
 The gain is the blurred background divided by its mean, to the power `illumination_exponent`: where
@@ -60,8 +59,7 @@ class SensorCalibration:
     max_depth: float
     blur_sigmas: tuple[float, ...]  # of the gel's bulge, coarse to fine, m (`gel.deform`)
     noise: float  # standard deviation of the camera's noise, counts
-    # power of the background's brightness by which the response varies over the image
-    # (`illumination`)
+    # power of the background's brightness by which the response varies (`illumination`)
     illumination_exponent: float = 1.0
 
 

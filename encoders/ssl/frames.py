@@ -29,8 +29,7 @@ class TouchFrames:
     # preprocessed frames in half precision, to save memory. For objectives on several frames, the t
     # frames of a sample, newest first
     touch: Float16[Tensor, "n *t 3 h w"]
-    # simulated wrench on each pad (N, Nm, pad frame), for probes only; None if the episodes do not
-    # record it
+    # simulated wrench on each pad (N, Nm, pad frame), for probes only; None if not recorded
     wrench: Float[Tensor, "n 6"] | None
     sensor: str  # name of the fingertip sensor
     stride: int = 1  # ticks between the frames of a sample

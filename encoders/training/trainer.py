@@ -41,8 +41,7 @@ class OptimizerConfig:
     lr: float  # highest learning rate
     weight_decay: float  # of weight matrices and convolutions; not biases, norms and tokens
     betas: tuple[float, float] = (0.9, 0.999)  # Adam's betas
-    # AdamW (Loshchilov and Hutter 2019); otherwise Adam with weight decay as an L2 term in the
-    # gradient
+    # AdamW (Loshchilov and Hutter 2019); otherwise Adam, with an L2 term in the gradient
     decoupled_weight_decay: bool = True
     warmup: float = 0.1  # share of the steps in which the rate rises linearly from 0
     max_warmup_steps: float = math.inf  # upper bound of these steps
@@ -102,8 +101,7 @@ class Training:
     # parameters that require a gradient are trained
     loss: nn.Module
     n_samples: int  # samples of an epoch
-    # makes a batch of these samples on the CPU, one entry per sample; its random numbers come from
-    # the `BatchNoise`
+    # makes a batch of these samples on the CPU, one entry each; random only by the `BatchNoise`
     batch: Callable[[Int[Tensor, " b"], BatchNoise], dict[str, Any]]
     optimizer: OptimizerConfig  # settings of the optimizer
     identity: Mapping[str, Any]  # JSON-able: data and settings; a run resumes only with the same

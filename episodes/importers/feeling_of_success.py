@@ -1,7 +1,7 @@
 """Grasp outcomes with two tactile sensors: The Feeling of Success (Calandra et al., CoRL 2017).
 
 Layout of Sparsh's converter, T4 of TacBench (arXiv 2410.24090, C.6): files `000.pkl` to `035.pkl`, each a
-dictionary of lists with one entry a grasp: `object_name`, `is_gripping`, and `gelsightA_before`,
+dictionary of lists with one entry per grasp: `object_name`, `is_gripping`, and `gelsightA_before`,
 `..._during`, `..._after`, and the same of B, encoded images. The converter gave RGB to OpenCV's writer,
 which takes BGR, so red and blue are exchanged back here. Published split: files 000 to 029 are for training.
 """

@@ -4,7 +4,6 @@ A folder holds `grasps.csv` (trial, object), and for each trial `TRIAL.avi` (a f
 and `TRIAL.csv` (force_newtons, gripper_width_m; one row per frame).
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +12,8 @@ from jaxtyping import Float, UInt8
 
 from touchgoal.control.sensors.tactile_camera import rectify
 from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
+from touchgoal.episodes.importers.touch_sets.tables import check_there, read_table
 from touchgoal.episodes.media import read_frames
-from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Corners
 
 _COLUMNS = ("force_newtons", "gripper_width_m")
@@ -45,24 +44,11 @@ def read_force_grasps(folder: Path, corners: Corners | None = None) -> list[Forc
     UserError: a table, a column or a video is missing.
     """
     index = folder / "grasps.csv"
-    if not index.is_file():
-        raise UserError(f"no grasps.csv in {folder}: give a folder of grasps with it")
     grasps = []
-    with index.open(newline="") as file:
-        for row in csv.DictReader(file):
-            video, table = (folder / f"{row['trial']}.{kind}" for kind in ("avi", "csv"))
-            for path in (video, table):
-                if not path.is_file():
-                    raise UserError(f"{path} is missing, which {index} names")
-            force, width = _read_table(table)
-            grasps.append(ForceGrasp(row["trial"], row["object"], video, force, width, corners))
+    for row in read_table(index, ("trial", "object")):
+        video, table = (folder / f"{row['trial']}.{kind}" for kind in ("avi", "csv"))
+        check_there((video, table), index)
+        rows = read_table(table, _COLUMNS)
+        force, width = (np.array([float(row[name]) for row in rows]) for name in _COLUMNS)
+        grasps.append(ForceGrasp(row["trial"], row["object"], video, force, width, corners))
     return grasps
-
-
-def _read_table(path: Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    with path.open(newline="") as file:
-        reader = csv.DictReader(file)
-        if missing := [name for name in _COLUMNS if name not in (reader.fieldnames or ())]:
-            raise UserError(f"{path} lacks the column {missing[0]}")
-        rows = np.array([[float(row[name]) for name in _COLUMNS] for row in reader])
-    return rows[:, 0], rows[:, 1]

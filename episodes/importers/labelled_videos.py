@@ -4,7 +4,6 @@ A folder holds `videos/` and `labels.csv` with the columns file, object, name, s
 unlabelled), hardness, roughness and bumpiness (0, 1 or 2 each; empty where not ranked).
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from touchgoal.episodes.importers.touch_sets.tables import check_there, read_table
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.touches import touch_background
 from touchgoal.runtime.errors import UserError
@@ -67,15 +67,8 @@ def read_labelled_videos(folder: Path) -> list[LabelledVideo]:
     UserError: no such table, a column or a video is missing, or a rank is not 0, 1 or 2.
     """
     table = folder / _TABLE
-    if not has_labels(folder):
-        raise UserError(f"no labels.csv in {folder}: give a folder of PhysiCLeAR videos with it")
-    with table.open(newline="") as file:
-        reader = csv.DictReader(file)
-        if missing := [name for name in _COLUMNS if name not in (reader.fieldnames or ())]:
-            raise UserError(f"{table} lacks the column {missing[0]}")
-        videos = [_video(folder, row) for row in reader]
-    if absent := [video.path for video in videos if not video.path.is_file()]:
-        raise UserError(f"{table} names {absent[0].name}, which is not in {folder / 'videos'}")
+    videos = [_video(folder, row) for row in read_table(table, _COLUMNS)]
+    check_there((video.path for video in videos), table)
     return videos
 
 

@@ -94,9 +94,8 @@ def _distance(
 
 
 def _positions(joints: Float[np.ndarray, "... 7"]) -> Float[np.ndarray, "... 3"]:
-    kinematics = Fr3Kinematics()
-    rows = [kinematics.forward(q)[0] for q in joints.reshape(-1, 7).astype(np.float64)]
-    return np.array(rows).reshape(*joints.shape[:-1], 3)
+    positions, _, _ = Fr3Kinematics().forward_many(joints.reshape(-1, 7).astype(np.float64))
+    return positions.reshape(*joints.shape[:-1], 3)
 
 
 def zero_motion(horizon: int) -> Plan:

@@ -27,9 +27,8 @@ _START_ERROR = np.array([0.003, 0.003, 0.0015, 0.03, 0.03, 0.0015, 0.0015])
 class DaggerRoles:
     """Actor and expert of a recording, see `Roles` in `episodes/recording.py`."""
 
-    # makes the policy that acts while the expert's actions are recorded (DAgger, Ross et al. 2011);
-    # one with a state estimator acts on the simulator's truth with noise instead. None: the expert
-    # itself acts
+    # makes the policy that acts while the expert's actions are recorded (DAgger, Ross et al. 2011),
+    # on true states with noise if it has a state estimator. None: the expert itself acts
     policy: Callable[[Any], Actor] | None = None
 
     def __call__(self, env: FrankaTactileEnv, spec: EpisodeSpec) -> tuple[Actor, Actor]:

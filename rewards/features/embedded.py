@@ -44,8 +44,7 @@ class EmbeddedEpisode:
     image: Float32[np.ndarray, "n d"] | None = None  # unit image embeddings; None without a camera
     sides: tuple[str, ...] = ()  # keys of the fingertips that have touch embeddings
     touch: Float32[np.ndarray, "sides n k"] | None = None  # unit embeddings; None without touch
-    # unit embeddings of the sentences about its object; None if there are none or they were not
-    # requested
+    # unit embeddings of the sentences about its object; None without sentences, or not requested
     descriptions: Float32[np.ndarray, "m k"] | None = None
     object: str = ""  # catalogue id of the object, "" if unknown
     success: bool | None = None  # whether the episode reached its goal, None if unknown

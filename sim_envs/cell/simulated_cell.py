@@ -81,10 +81,9 @@ class SimulatedCell:
         # q_d, dq_d: their set-points; tau_ext: torque (N m) on each joint from outside, filtered
         self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
         self.q, self.dq = env.joints()  # measured joint positions (rad), velocities (rad/s)
-        error_rng = np.random.default_rng(
-            [seed, _ERROR_STREAM]
-        )  # the episode's draws stay the same
-        self._error = WrenchError(error_rng) if self._errs else None
+        # A stream of its own: the episode's other draws do not depend on it.
+        rng = np.random.default_rng([seed, _ERROR_STREAM])
+        self._error = WrenchError(rng) if self._errs else None
         # N, N m, by which the arm's estimate of the wrench on the hand is wrong
         self.wrench_error = self._error.read() if self._error else np.zeros(6)
         self.gripper_command = GripperCommand(

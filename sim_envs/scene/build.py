@@ -126,8 +126,7 @@ def add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
     """Add carriage, adapter, sensor case and gel of one finger.
 
     The gel is a rigid plate on three springs (normal, two shear). Its collision box reaches 12 mm
-    into
-    the case, because a thin box flips its contact normals when squeezed.
+    into the case, because a thin box flips its contact normals when squeezed.
     """
     finger = spec.body(f"{side}_finger")
     box = mujoco.mjtGeom.mjGEOM_BOX

@@ -39,7 +39,7 @@ class PadContact:
 
 
 class ContactReader:
-    """Reads a model's contacts; one pass over them a control tick."""
+    """Reads a model's contacts, in one pass per control tick."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
@@ -105,7 +105,7 @@ class ContactReader:
 
 
 class Contacts(NamedTuple):
-    """MuJoCo's contacts as arrays: a row each."""
+    """MuJoCo's contacts as arrays, one row per contact."""
 
     geoms: Int[np.ndarray, "k 2"]
     frames: Float[np.ndarray, "k 9"]

@@ -32,7 +32,7 @@ class SceneRecorder:
         self._pictures: list[np.ndarray] = []
 
     def capture(self) -> None:
-        """Draw the environment; call it once a tick, of which every second is drawn."""
+        """Draw the environment; call it once per tick, every second call draws."""
         self._ticks += 1
         if self._ticks % TICKS_PER_PICTURE != 1:
             return

@@ -146,7 +146,7 @@ def choose(split: Split, count: int, families: tuple[Family, ...] = TRAINED) -> 
     each = -(-count // len(families))
     if each > PER_FAMILY[split]:
         raise UserError(
-            f"there are {PER_FAMILY[split]} {split} wires a family; ask for fewer than {each}"
+            f"there are {PER_FAMILY[split]} {split} wires per family; ask for fewer than {each}"
         )
     rows = zip(*(_distinct(family, split, each) for family in families), strict=True)
     return [wire for row in rows for wire in row][:count]

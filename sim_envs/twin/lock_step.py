@@ -23,8 +23,7 @@ class LockStep:
     """Time that advances only as its holder asks.
 
     Advancing begins once the arm's client drives it (if the holder says so) and the hand has
-    received
-    what was sent, and ends once the arm's client has answered the last state.
+    received what was sent. It ends once the arm's client has answered the last state.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""T4 and T6: one label a pair of frames, whether a grasp holds or which cloth it is."""
+"""T4 and T6: one label per pair of frames, whether a grasp holds or which cloth it is."""
 
 from collections.abc import Callable
 

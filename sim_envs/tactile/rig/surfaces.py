@@ -211,7 +211,5 @@ _NAMED: dict[str, Callable[[np.random.Generator, float | None], Tile]] = {
 @cache
 def named_tile(name: str) -> Tile:
     """Return the tile of a texture of the object catalogues: heights from about -1 to 1."""
-    tile = 2 * _unit(
-        _NAMED[name](np.random.default_rng(5), WAVELENGTH)
-    )  # strands and letters are raised
-    return np.ascontiguousarray(np.clip(tile, -1.5, 1.5), np.float32)
+    tile = _unit(_NAMED[name](np.random.default_rng(5), WAVELENGTH))
+    return np.ascontiguousarray(np.clip(2 * tile, -1.5, 1.5), np.float32)  # strands are raised

@@ -35,8 +35,7 @@ class FrankaArm(Service):
 
     def __init__(self, cell: SimulatedCell, host: str, timeout: float, hand: messages.Link) -> None:
         """`hand`: the hand's link, which shares the arm's cable."""
-        # timeout: s to wait for a client's answer to each state; the packet counts as lost only
-        # then
+        # timeout: s to wait for a client's answer to a state before the packet counts as lost
         self.cell, self.timeout = cell, timeout
         # mode: idle, moving, in a reflex, or user-stopped; error: the error in force
         self.mode, self.error = RobotMode.IDLE, ""
