@@ -107,18 +107,17 @@ def _load_parts(
     return network, touch, estimator
 
 
-def load_policy(name_or_path: str | Path, plan_ticks: int = 0) -> LearnedPolicy:
+def load_policy(name_or_path: str | Path) -> LearnedPolicy:
     """Load a policy to act with.
 
     Args:
         name_or_path: name of a shipped policy ("pick-place", "bead-maze", "bead-maze-diffusion"),
             or a folder that train-policy made.
-        plan_ticks: control ticks by which its plans come late, see `LearnedPolicy`.
 
     Raises:
         UserError: no such policy, or it is damaged.
     """
-    return SavedPolicy(find_policy(name_or_path), plan_ticks)()
+    return SavedPolicy(find_policy(name_or_path))()
 
 
 def find_policy(name_or_path: str | Path) -> Path:

@@ -234,5 +234,5 @@ class Kinematics:
 class Fr3Kinematics(Kinematics):
     """The FR3 with the Franka Hand."""
 
-    def __init__(self, tcp_offset: float = FRANKA_HAND.tcp_offset) -> None:
-        super().__init__(FR3_ARM, tcp_offset)
+    def __init__(self) -> None:
+        super().__init__(FR3_ARM, FRANKA_HAND.tcp_offset)

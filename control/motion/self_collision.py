@@ -68,6 +68,7 @@ _UR5E = (
 
 _BODIES = {FR3_ARM.name: _FR3, UR5E_ARM.name: _UR5E}
 _POINT = 1e-12  # m^2; a shorter segment is a point
+_LEAST_GAP = 5e-3  # m
 _NEIGHBOURS = 3  # parts in a row that the joints' ranges alone keep apart
 
 
@@ -97,15 +98,13 @@ class SelfDistance:
         return (apart - self._radii).min(axis=1)
 
 
-def require_no_self_collision(
-    trajectory: Trajectory, distance: SelfDistance, margin: float = 5e-3
-) -> None:
-    """UserError if parts of the arm come closer than `margin` (m) on the way (checked at 100 Hz)."""
+def require_no_self_collision(trajectory: Trajectory, distance: SelfDistance) -> None:
+    """UserError if parts of the arm come closer than 5 mm on the way (checked at 100 Hz)."""
     gap = distance.gap(trajectory.sample(100))
-    if gap.min() < margin:
-        k = int(np.argmax(gap < margin))
+    if gap.min() < _LEAST_GAP:
+        k = int(np.argmax(gap < _LEAST_GAP))
         raise UserError(
-            f"the arm would come within {1e3 * margin:.0f} mm of itself {k / 100:.1f} s after the "
+            f"the arm would come within {1e3 * _LEAST_GAP:.0f} mm of itself {k / 100:.1f} s after the "
             "move's start: go by way of another posture"
         )
 

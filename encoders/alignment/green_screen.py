@@ -23,6 +23,7 @@ _DARK = 12  # counts, sum of the colours, below which a pixel's chromaticity is 
 _GREEN = 0.45  # least share of green in a screen
 _LEAST_GREEN = 0.05  # least share of a picture that a screen takes up
 _SMALLEST = 6  # px: specks below this area are noise
+_SIZE = 224, 224  # rows and columns of a random background
 _PICTURES = (".png", ".jpg", ".jpeg")
 
 
@@ -84,9 +85,9 @@ def read_backgrounds(folder: Path) -> list[Picture]:
     return [picture for _, picture in pictures if picture is not None]
 
 
-def random_background(rng: np.random.Generator, size: tuple[int, int] = (224, 224)) -> Picture:
+def random_background(rng: np.random.Generator) -> Picture:
     """Draw a background: coloured clouds of several sizes, and a few edges as of furniture."""
-    h, w = size
+    h, w = _SIZE
     picture = np.full((h, w, 3), rng.uniform(30, 220, 3), np.float32)
     for cells in (2, 5, 12, 30):
         clouds = rng.normal(0, 90 / np.sqrt(cells), (cells, cells, 3)).astype(np.float32)

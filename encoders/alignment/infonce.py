@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+_FLOOR_STEPS = 50  # of Frank and Wolfe
+
 
 def info_nce(
     anchor: Float[Tensor, "n d"],
@@ -44,7 +46,6 @@ def loss_floor(
     target: Float[Tensor, "n d"],
     temperature: float,
     positives: Bool[Tensor, "n n"] | None = None,
-    steps: int = 50,
 ) -> float:
     """Return the least `info_nce` that any anchors can reach against these fixed targets.
 
@@ -61,7 +62,7 @@ def loss_floor(
     goal = (right / right.sum(1, keepdim=True)).to(target)
     anchor = torch.nn.functional.normalize(goal @ target, dim=1)
     best = torch.full((n,), -torch.inf, dtype=torch.float64, device=target.device)
-    for step in range(steps):
+    for step in range(_FLOOR_STEPS):
         logits = anchor @ target.T / temperature
         loss = logits.logsumexp(1) - (goal * logits).sum(1)
         gradient = (logits.softmax(1) - goal) @ target / temperature

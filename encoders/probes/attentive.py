@@ -11,13 +11,13 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-_NARROWER = 4  # width of the block over that of the head's hidden layer: 768 over 192, as published
+_WIDTH, _HEADS = 128, 4  # of a probe's pooler
 
 
 class AttentivePooler(nn.Module):
     """Pooling of tokens to one vector by a learned query and an MLP, both with residuals."""
 
-    def __init__(self, features: int, width: int, heads: int, mlp_ratio: float = 4.0) -> None:
+    def __init__(self, features: int, width: int, heads: int) -> None:
         """Build a randomly initialised block; `heads` divides the width of query and output."""
         super().__init__()
         self.heads = heads
@@ -27,8 +27,8 @@ class AttentivePooler(nn.Module):
         self.kv = nn.Linear(features, 2 * width)
         self.proj = nn.Linear(width, width)
         self.norm2 = nn.LayerNorm(width)
-        self.mlp_in = nn.Linear(width, int(width * mlp_ratio))
-        self.mlp_out = nn.Linear(int(width * mlp_ratio), width)
+        self.mlp_in = nn.Linear(width, 4 * width)
+        self.mlp_out = nn.Linear(4 * width, width)
         for linear in (self.q, self.kv, self.proj, self.mlp_in, self.mlp_out):
             nn.init.trunc_normal_(linear.weight, std=0.02)
             nn.init.zeros_(linear.bias)
@@ -53,13 +53,13 @@ class AttentivePooler(nn.Module):
 
 
 class AttentiveProbe(nn.Module):
-    """Probe of an attentive pooler and a hidden layer of a quarter of its width."""
+    """Probe of an attentive pooler and a hidden layer of a quarter of its width, as published."""
 
-    def __init__(self, features: int, outputs: int, width: int = 128, heads: int = 4) -> None:
+    def __init__(self, features: int, outputs: int) -> None:
         super().__init__()
-        self.pooler = AttentivePooler(features, width, heads)
-        self.hidden = nn.Linear(width, width // _NARROWER)
-        self.out = nn.Linear(width // _NARROWER, outputs)
+        self.pooler = AttentivePooler(features, _WIDTH, _HEADS)
+        self.hidden = nn.Linear(_WIDTH, _WIDTH // 4)
+        self.out = nn.Linear(_WIDTH // 4, outputs)
 
     def forward(self, tokens: Float[Tensor, "b t f"]) -> Float[Tensor, "b k"]:
         """Return the outputs, unbounded."""

@@ -94,9 +94,9 @@ def train(
     return checkpoint.load(out_dir / POLICY)
 
 
-def ema_decay(step: int, power: float = 0.75, greatest: float = 0.9999) -> float:
+def ema_decay(step: int) -> float:
     """Return the decay after `step` updates, by diffusion_policy's schedule and constants."""
-    return min(greatest, 1 - (1 + step) ** -power)
+    return min(0.9999, 1 - (1 + step) ** -0.75)
 
 
 @torch.no_grad()

@@ -44,8 +44,8 @@ class EpisodeEmbedder:
     """Embeds trajectories and goals with frozen encoders.
 
     The background of each fingertip is the median of the episode's first 5 frames, which must be
-    free of contact. With `with_parts` it embeds everything that the parts of a cost need: both
-    cameras, their maps, and the contact of the fingertips; without, one camera and touch.
+    free of contact. While `with_parts` is true it embeds everything that the parts of a cost need:
+    both cameras, their maps, and the contact of the fingertips; otherwise one camera and touch.
     """
 
     def __init__(
@@ -53,7 +53,6 @@ class EpisodeEmbedder:
         towers: Towers,
         encoder: AnyTouchEncoder | None,
         camera: str = FRONT,
-        with_parts: bool = True,
     ) -> None:
         """Take the encoders.
 
@@ -63,14 +62,13 @@ class EpisodeEmbedder:
             encoder: touch encoder (put into evaluation mode), which takes sentences if it was aligned
                 with these towers; None to measure images alone.
             camera: key of the camera whose images are measured; "" for a plain video's.
-            with_parts: whether to embed the parts of a cost, too.
         """
         self._towers = towers
         self.encoder = encoder
         self._aligned = encoder if encoder is not None and encoder.towers else None
         self.knows_words = self._aligned is not None  # touch can be compared with sentences
         self.camera = camera
-        self.with_parts = with_parts
+        self.with_parts = True
         self._ends: dict[Bank | GoalFile, SuccessfulEnds] = {}
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
         self._pictures_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)

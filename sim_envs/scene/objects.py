@@ -156,8 +156,8 @@ def sample_body(
     return Body(kind, size, mass, name, hull)
 
 
-def _unit_hull(rng: np.random.Generator, n: int = 24) -> Float[np.ndarray, "n 3"]:
+def _unit_hull(rng: np.random.Generator) -> Float[np.ndarray, "24 3"]:
     """Draw points near the unit sphere, the shape of a stone."""
-    points = rng.normal(size=(n, 3))
-    points *= rng.uniform(0.85, 1.0, (n, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    points = rng.normal(size=(24, 3))
+    points *= rng.uniform(0.85, 1.0, (24, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
     return points * (1.0, 1.0, 1.1)

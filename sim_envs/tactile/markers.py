@@ -182,18 +182,14 @@ def _draw(image, columns, centres, radius, darkness):
 
 
 def draw(
-    image: UInt8[np.ndarray, "h w 3"],
-    centres: Float32[np.ndarray, "n 2"],
-    radius: float | int,
-    darkness: float | int = DARKNESS,
+    image: UInt8[np.ndarray, "h w 3"], centres: Float32[np.ndarray, "n 2"], radius: float | int
 ) -> None:
     """Darken dots in place, with smooth rims; dots may lie partly or wholly outside the image.
 
     Args:
         centres: (x, y) in px, pixel centres at integers.
         radius: px, at least 1.
-        darkness: share of the light that a dot takes.
     """
     h, w, _ = image.shape
     columns = np.repeat(np.arange(w, dtype=np.float32), 3)
-    _draw(image.reshape(h, 3 * w), columns, centres, np.float32(radius), np.float32(darkness))
+    _draw(image.reshape(h, 3 * w), columns, centres, np.float32(radius), np.float32(DARKNESS))
