@@ -91,8 +91,6 @@ def test_a_touch_is_no_background() -> None:
     touch = press(Body(GLASS, (0.01,), 0.1), 3.0).image
     with pytest.raises(UserError, match="untouched"):
         Background(np.concatenate([still, touch[None]]))
-    with pytest.raises(UserError, match="reference"):
-        Background(touch[None], reference=MINI.calibration.background)
 
 
 # Contact.

@@ -111,8 +111,7 @@ def check_sensor(
             steps.append(_noise(before, frame))
         before = frame
     followed = detector.background
-    drift = followed.drift()
-    followed.reference = calibration.background.astype(np.float32)
+    of_file = calibration.background.astype(np.float32)
     firm = _firmest(touches)
     untouched_now = np.rint(followed.image).astype(np.uint8)
     plain = dots.painted(untouched_now, at_rest=True)
@@ -127,9 +126,9 @@ def check_sensor(
         touching=len(touches),
         torn=torn,
         noise=float(np.median(steps)) if steps else None,
-        drift=drift,
-        drift_from_file=followed.drift(),
-        unlike_file=float(local_change(followed.image, followed.reference).max()),
+        drift=followed.drift(),
+        drift_from_file=followed.drift(of_file),
+        unlike_file=float(local_change(followed.image, of_file).max()),
         threshold=detector.threshold,
         untouched=max(untouched),
         touched=float(np.median([touch.strength for touch in firm])) if firm else 0.0,

@@ -24,7 +24,6 @@ _RATE = 0.02  # weight of a new frame: a time constant of 2 s at 25 Hz, slower t
 _OFFSET_SPREAD, _PATTERN_SPREAD = 2.4, 2.4
 _MOVED = 1.5  # counts of local change among the first frames, more than noise alone makes
 _JITTER = 1.0  # px by which a camera shakes; dots that move farther together are a touch
-_ANOTHER_SENSOR = 5.0  # counts of local change to a reference; the usual drift gives 3
 
 
 @dataclass(frozen=True)
@@ -49,12 +48,11 @@ class Drift:
 class Background:
     """Untouched frame of one sensor as it is now; `update` follows its drift.
 
-    It begins with the median of RGB frames of the untouched sensor, better five or more. Drift is
-    measured against a reference, such as the sensor file's, or else that median. UserError if the
-    picture changes between the frames, or differs from the reference as by a contact.
+    It begins with the median of RGB frames of the untouched sensor, better five or more. UserError
+    if the picture changes between the frames.
     """
 
-    def __init__(self, frames: Pictures, reference: Picture | None = None) -> None:
+    def __init__(self, frames: Pictures) -> None:
         first = np.median(frames, axis=0).astype(np.float32)
         if max(float(local_change(frame, first).max()) for frame in frames) > _MOVED:
             raise UserError(
@@ -63,12 +61,6 @@ class Background:
             )
         self.steady, self._frames = first.copy(), len(frames)
         self._first, self._gain = first, np.ones(3, np.float32)
-        self.reference = first if reference is None else reference.astype(np.float32)
-        if float(local_change(first, self.reference).max()) > _ANOTHER_SENSOR:
-            raise UserError(
-                "the touch sensor's first frames do not look like its untouched reference: "
-                "take away what touches it, or calibrate this sensor"
-            )
 
     @property
     def image(self) -> Counts:
@@ -83,9 +75,9 @@ class Background:
         self._gain += rate * (gain - self._gain)
         cv2.accumulateWeighted(divide_gain(frame, gain), self.steady, rate)
 
-    def drift(self) -> Drift:
-        """Return the drift from the reference."""
-        reference = _blurred(self.reference).reshape(-1, 3)
+    def drift(self, reference: Counts | None = None) -> Drift:
+        """Return the drift from a reference, such as the sensor file's; None: the first frames."""
+        reference = _blurred(self._first if reference is None else reference).reshape(-1, 3)
         change = _blurred(self.image).reshape(-1, 3) - reference
         gain, offset = np.empty(3), np.empty(3)
         for c in range(3):

@@ -14,24 +14,18 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, UInt8
 
 from touchgoal.episodes.importers.labels import entry, numbers
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
-from touchgoal.episodes.importers.touch_clip import (
-    TouchClip,
-    check_sensor,
-    encoded_pictures,
-    read_picture_file,
-)
+from touchgoal.episodes.importers.touch_clip import TouchClip, encoded_pictures, read_picture_file
 from touchgoal.runtime.errors import UserError
 
 STRIDE = 5
 """Number of images over which a motion is measured."""
-Finger = Literal["index", "middle", "ring"]
+_PICTURES = "digit_ring"  # the finger that the paper uses
 _MILLIMETRE = 1e-3
 _MOST_SHIFT = 1000.0  # in the file's unit
 _OFF_ROTATION = 1e-2
@@ -45,8 +39,8 @@ class PoseBag:
     object: str  # sugar or pringles
     held_out: bool  # whether it belongs to the published test set
     clip: TouchClip  # images
-    # change of the object's pose over the last `STRIDE` images (m along x and y, rad), one row an
-    # image; the first `STRIDE` rows have no such past
+    # change of the object's pose over the last `STRIDE` images (m along x and y, rad), one row
+    # per image; the first `STRIDE` rows have no such past
     change: Float64[np.ndarray, "n 3"]
     untouched: Path  # image file of the finger without contact
 
@@ -55,34 +49,25 @@ class PoseBag:
         return read_picture_file(self.untouched, self.clip.sensor)
 
 
-def read_bags(
-    folder: Path, finger: Finger = "ring", sensor: str | None = None
-) -> Iterator[PoseBag]:
-    """Read the recordings of a published folder, one at a time.
+def read_bags(folder: Path) -> Iterator[PoseBag]:
+    """Read the recordings of the ring finger in a published folder (train/, test/), one at a time.
 
-    UserError: no such files, another sensor's, or a content that is not as published.
-
-    Args:
-        folder: Folder with train/ and test/.
-        finger: Finger; the paper uses the ring finger.
-        sensor: Sensor model, which must be a DIGIT.
+    UserError: no such files, or a content that is not as published.
     """
     paths = _bags(folder)
     if not paths:
         raise UserError(
             f"{folder} holds no train/OBJECT/bag_00.pkl: give the folder of TacBench's pose estimation"
         )
-    named = check_sensor(sensor, ("digit",), folder)
-    untouched = folder / "bgs" / f"digit_{finger}.png"
+    untouched = folder / "bgs" / f"{_PICTURES}.png"
     if not untouched.is_file():
-        raise UserError(f"{untouched} is missing, which shows the {finger} finger without contact")
+        raise UserError(f"{untouched} is missing, which shows the ring finger without contact")
     for path in paths:
         bag = read_plain_pickle(path)
-        key = f"digit_{finger}"
-        pictures = encoded_pictures(entry(bag, key, str(path)), f"'{key}' of {path}")
-        change = _planar(entry(bag, f"object_{finger}_rel_pose_n{STRIDE}", str(path)), str(path))
+        pictures = encoded_pictures(entry(bag, _PICTURES, str(path)), f"'{_PICTURES}' of {path}")
+        change = _planar(entry(bag, f"object_ring_rel_pose_n{STRIDE}", str(path)), str(path))
         count = min(len(pictures), len(change))
-        clip = TouchClip(f"{path} ({finger})", named, pictures[:count])
+        clip = TouchClip(str(path), "digit", pictures[:count])
         held_out = path.parent.parent.name == "test"
         yield PoseBag(str(path), path.parent.name, held_out, clip, change[:count], untouched)
 
