@@ -26,7 +26,6 @@ from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, SensorModel, 
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.perception.end_to_end import difference_images
-from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
@@ -143,6 +142,10 @@ def test_the_background_follows_the_light_and_still_reports_it() -> None:
     assert np.abs(background.steady - rest).max() < 2
     assert background.image / rest == pytest.approx(np.broadcast_to(DIM, rest.shape), abs=0.05)
     assert background.drift().large
+    still = Background(rest[None])
+    for _ in range(50):
+        still.update(lit(rest, np.full(3, 1.04)))
+    assert not still.drift().large
 
 
 @pytest.mark.parametrize("task", SHIPPED_POLICIES)
@@ -169,12 +172,6 @@ def test_the_environment_changes_the_light_after_the_first_picture() -> None:
     (first, later), (same, usual) = pictures
     np.testing.assert_array_equal(first, same)
     np.testing.assert_array_equal(later, lit(usual, np.array([0.8, 1.1, 1.0], np.float32)))
-
-
-@pytest.mark.parametrize("change", [(0.1, 0.2), (-0.99,), (2.0,)])
-def test_a_light_change_that_is_none_is_refused(change: tuple[float, ...]) -> None:
-    with pytest.raises(UserError, match="light_change"):
-        PickPlaceConfig(light_change=change)
 
 
 def test_a_large_change_of_the_light_is_reported_and_a_touch_is_not() -> None:
