@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from jaxtyping import Float, Float32, Int32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
@@ -202,15 +202,6 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         assert self._renderer is not None
         self._renderer.update_scene(bench.data, "side_left", bench.shown)
         return self._renderer.render()
-
-    def segment(self, view: str) -> Int32[np.ndarray, "H W"]:
-        """Return the geom that each pixel of a view shows now, -1 for none."""
-        assert self._renderer is not None, "views are off"
-        self._renderer.enable_segmentation_rendering()
-        self._renderer.update_scene(self.bench.data, view, self.bench.shown)
-        segments = self._renderer.render()[..., 0]
-        self._renderer.disable_segmentation_rendering()
-        return segments
 
     def close(self) -> None:
         """Free the renderer."""

@@ -135,6 +135,9 @@ class FakeCell:
         self.cameras: dict = {}
         self.log = RunLog()
 
+    def connection(self) -> CellConnection:
+        return CellConnection(FR3, self.arm, self.gripper, self.cameras, self.load_cell, self.clock)
+
     def run(
         self,
         each_tick: Callable[[int], None],
@@ -151,11 +154,8 @@ class FakeCell:
             seconds: after which it ends.
             execute: False: a dry run.
         """
-        connection = CellConnection(
-            FR3, self.arm, self.gripper, self.cameras, self.load_cell, self.clock
-        )
         safety = ActionFilter(FR3, ft.CONTROL_HZ)
-        loop = ControlLoop(connection, safety, execute, lambda: "", lambda _: None)
+        loop = ControlLoop(self.connection(), safety, execute, lambda: "", lambda _: None)
         self.log = RunLog()
 
         class Moves(Actor):

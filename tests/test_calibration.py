@@ -1,6 +1,7 @@
 """Calibration: known lights come back from presses, sensor files come back from disk."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -163,40 +164,23 @@ def set_row(column: int, value: str) -> Callable[[Path], None]:
     return damage
 
 
-def without_balls(table: str) -> str:
-    head, *rows = table.splitlines()
-    return "\n".join([head, *(row.rpartition(",")[0] + "," for row in rows)])
-
-
-def cut_table(folder: Path) -> None:
-    edit(folder, "presses.csv", lambda t: "\n".join(t.splitlines()[:9]))
-
-
-def other_size(folder: Path) -> None:
-    cv2.imwrite(str(folder / "00.png"), np.zeros((100, 100, 3), np.uint8))
-
-
-def no_contact(folder: Path) -> None:
-    (folder / "00.png").write_bytes((folder / "background.png").read_bytes())
-
-
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
-        (cut_table, "8 presses, calibration needs at least 16"),
+        (
+            lambda f: edit(f, "presses.csv", lambda t: "\n".join(t.splitlines()[:9])),
+            "8 presses, calibration needs at least 16",
+        ),
         (lambda f: (f / "background.png").unlink(), "background.png is missing"),
-        (lambda f: (f / "presses.csv").unlink(), "give --ball-mm if one ball"),
-        (lambda f: (f / "00.png").unlink(), "00.png is missing"),
         (lambda f: edit(f, "presses.csv", lambda t: t.replace("file", "name")), "column file"),
-        (set_row(1, "left"), "line 2"),
         (set_row(1, "170"), "lies outside the 160 x 120 picture"),
         (set_row(3, "30"), "does not fit a ball of radius 3 mm"),
-        (set_row(3, "1"), "too small"),
         (set_row(4, ""), "the ball's radius is missing"),
-        (set_row(4, "-2"), "ball_mm"),
-        (other_size, "100 x 100 pixels, background.png 160 x 120"),
-        (no_contact, "shows no contact"),
-        (lambda f: edit(f, "presses.csv", without_balls), "the ball's radius is missing"),
+        (
+            lambda f: cv2.imwrite(str(f / "00.png"), np.zeros((100, 100, 3), np.uint8)),
+            "100 x 100 pixels, background.png 160 x 120",
+        ),
+        (lambda f: shutil.copy(f / "background.png", f / "00.png"), "shows no contact"),
     ],
 )
 def test_unfit_presses_are_refused(
@@ -227,15 +211,12 @@ def test_sensor_file_comes_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
-        (lambda f: (f / "sensor.json").unlink(), "no sensor file in"),
         (lambda f: (f / "background.png").unlink(), "background.png is missing"),
         (lambda f: edit(f, "sensor.json", lambda t: t[:99]), "is no sensor file"),
         (lambda f: edit(f, "sensor.json", lambda t: t.replace('t": 2', 't": 9')), "has format 9"),
         (lambda f: edit(f, "sensor.json", lambda t: t.replace("noise", "nose")), "no usable noise"),
         (lambda f: edit(f, "sensor.json", lambda t: t.replace("120,", "240,")), "rows and columns"),
-        (lambda f: edit(f, "sensor.json", lambda t: t.replace("25.0, ", "")), "shadow is (3, 3)"),
         (lambda f: edit(f, "sensor.json", lambda t: t.replace("0.9", "-0.9")), "must be positive"),
-        (lambda f: edit(f, "sensor.json", lambda t: t.replace("0.9", "NaN")), "must be positive"),
     ],
 )
 def test_foreign_sensor_file_is_refused(

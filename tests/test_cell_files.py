@@ -42,9 +42,7 @@ def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     for name in ("sim", "sim.toml", "control/cell/examples/sim.toml"):
         assert find_cell_file(Path(name)) == EXAMPLES / "sim.toml"
-    with pytest.raises(
-        UserError, match="no cell file mine.toml.*fr3_two_minis, sim, sim_maze, ur5e"
-    ):
+    with pytest.raises(UserError, match="no cell file mine.toml.*fr3_two_minis, sim, sim_maze"):
         find_cell_file(Path("mine.toml"))
     (tmp_path / "sim.toml").write_text(SIM)
     assert find_cell_file(Path("sim.toml")) == Path("sim.toml")
@@ -54,11 +52,8 @@ def test_the_cells_tool_is_the_one_that_is_watched(tmp_path: Path) -> None:
     """Longer fingers: the TCP and the corners are theirs."""
     cell = read_cell_file(EXAMPLES / "ur5e.toml")
     assert cell.tool is not None
-    longer = replace(
-        cell.tool,
-        tcp=0.3,
-        finger_corners=tuple((x, y, 0.32) for x, y, _ in cell.tool.finger_corners),
-    )
+    corners = tuple((x, y, 0.32) for x, y, _ in cell.tool.finger_corners)
+    longer = replace(cell.tool, tcp=0.3, finger_corners=corners)
     limits = cell_limits(replace(cell, tool=longer))
     assert limits.tool.tcp_offset == 0.3 and limits.tool.mass == cell.tool.mass
     before, after = (
@@ -71,9 +66,7 @@ def test_the_cells_tool_is_the_one_that_is_watched(tmp_path: Path) -> None:
 def test_a_touch_ceiling_that_no_picture_can_show_is_refused() -> None:
     require_readable(find_sensor("digit"), 1.5e-3)
     require_readable(find_sensor("gelsight_mini"), FR3.indentation)
-    with pytest.raises(
-        UserError, match="deeper than the sensor file of the gelsight_mini can read"
-    ):
+    with pytest.raises(UserError, match="deeper than the sensor file of the gelsight_mini"):
         require_readable(find_sensor("gelsight_mini"), 5e-3)
 
 
@@ -100,45 +93,23 @@ def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
     [
         (SIM.replace('arm = "sim"', ""), "arm is missing"),
         (SIM.replace('"sim"', '"fr4"'), "arm must be 'fr3', 'ur5e' or 'sim', not 'fr4'"),
-        (SIM.replace('"sim"', '"fr3"'), "address is missing"),
         (
             SIM.replace('"sim"', '"fr3"\naddress = "a"').replace('_hand"', '_hand", address = "a"'),
             "tool is missing: measure tcp, mass, centre_of_mass and finger_corners",
-        ),
-        (
-            SIM
-            + "tool = { tcp = 0.1, mass = inf, centre_of_mass = [0, 0, 0], finger_corners = [] }",
-            "tool.mass must be a finite number",
         ),
         (SIM.replace("cameras.front", "cameras.back"), "cameras.back must be 'front' or 'wrist'"),
         (SIM.replace("policy =", "polcy ="), "task.polcy is unknown: did you mean policy?"),
         (SIM.replace("seed = 3", 'seed = "3"'), "task.seed must be a valid integer, not '3'"),
         (SIM.replace("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),
-        (SIM.replace('_hand"', '_hand", force = 90'), "gripper.force must lie between 0 and 70 N"),
-        (
-            SIM + "safety = { force = nan }",
-            "safety.force must be a finite number, not nan: External",
-        ),
-        (SIM + "safety = { velocity_share = 20 }", "safety.velocity_share must be less than or eq"),
+        (SIM + "safety = { force = nan }", "safety.force must be a finite number, not nan: Ext"),
         (SIM + "safety = { velocity_share = 0 }", "safety.velocity_share must be greater than 0"),
-        (SIM + "safety = { observation_age = inf }", "safety.observation_age must be a finite"),
-        (SIM + "safety = { flange_lower = [0, 0, 0, 0] }", "safety.flange_lower must have 3 val"),
         (SIM + "safety = 3", "safety must be a section with keys of its own"),
         (SIM + 'fingertips = { sensor = "digt", left = "", right = "" }', "fingertips.sensor: dig"),
         ("arm =", "is no TOML"),
-        (
-            SIM.replace("seed = 3", r'instruction = "\u001b[2J"'),
-            "task.instruction has control char",
-        ),
-        (
-            SIM.replace("seed = 3", "grasp = [0.5, 0, -0.2, 0]"),
-            "task.grasp [0.5, 0.0, -0.2] is outs",
-        ),
-        (
-            SIM.replace("seed = 3", "goal = [1.9, 0]"),
-            "task.goal [1.9, 0.0] is outside the fingertips",
-        ),
-        (REAL.replace("-0.01", "3.6"), "tool.centre_of_mass.0 must be less than or equal to 0.5"),
+        (SIM.replace("pick-place", "pick_place"), "task.name is pick_place: did you mean pick-pl"),
+        (SIM.replace("pick-place", "plug"), "task.policy: expert is for pick-place and bead-maze"),
+        (SIM.replace("seed = 3", r'instruction = "\u001b"'), "task.instruction has control char"),
+        (SIM.replace("seed = 3", "grasp = [0.5, 0, -0.2, 0]"), "task.grasp [0.5, 0.0, -0.2] is ou"),
         (re.sub(r"0\.1(539|209)", "0.0", REAL), "tool.finger_corners span [29.0, 140.0, 0.0] mm"),
         (REAL.replace("tcp = 0.1374", "tcp = 0.4"), "tool.finger_corners leave out the TCP"),
         (REAL.replace("2BNKH4TQ", "2BNK9P3X"), "fingertips.left and fingertips.right are both"),

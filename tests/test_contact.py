@@ -59,18 +59,11 @@ def background_of(frames: np.ndarray) -> np.ndarray:
     return np.median(frames[:5], axis=0).astype(np.uint8)
 
 
-def test_drifting_light_is_no_contact() -> None:
-    n = 500
-    drift = 1 + 0.15 * np.sin(np.arange(n) / 80)
-    frames = sensed(drift, np.zeros(n))
-    assert np.abs(frames[125].mean() - frames[0].mean()) > 10, "the light must really drift"
-    assert not detect_contact(frames, background_of(frames)).any()
-
-
 def test_weak_shading_is_found_in_drifting_light() -> None:
-    height = np.zeros(60)
-    height[20:40] = 8
-    frames = sensed(1 + 0.002 * np.arange(60), height)
+    height = np.zeros(300)
+    height[20:40] = height[200:220] = 8
+    frames = sensed(1 + 0.15 * np.sin(np.arange(300) / 80), height)
+    assert np.abs(frames[125].mean() - frames[0].mean()) > 10, "the light must really drift"
     np.testing.assert_array_equal(detect_contact(frames, background_of(frames)), height > 0)
 
 
@@ -101,16 +94,6 @@ def test_any_picture_size(size: tuple[int, int]) -> None:
     assert not detect_contact(frames, frames[0]).any()
 
 
-def test_a_jpeg_streams_noise_is_no_contact() -> None:
-    height = np.zeros(40)
-    height[20:] = 20
-    frames = np.stack([through_jpeg(f) for f in sensed(np.ones(40), height)])
-    untouched, background = frames[:5], background_of(frames)
-    assert contact_strength(frames[:20], background).max() > THRESHOLD
-    touching = detect_contact(frames, background, threshold_for(untouched, background))
-    np.testing.assert_array_equal(touching, height > 0)
-
-
 def test_a_stream_that_starts_with_one_frame_learns_its_noise() -> None:
     """As deployed: one untouched frame, compression noise as of real clips, the light drifting on."""
     light = 1 + 0.002 * np.arange(80)
@@ -120,9 +103,7 @@ def test_a_stream_that_starts_with_one_frame_learns_its_noise() -> None:
     detector = ContactDetector(Background(frames[:1]))
     touching = [detector.update(frame) for frame in frames[1:]]
     np.testing.assert_array_equal(touching, height[1:] > 0)
-    assert contact_strength(frames[1:50], frames[0]).max() > THRESHOLD, (
-        "must fool a fixed threshold"
-    )
+    assert contact_strength(frames[1:50], frames[0]).max() > THRESHOLD, "fools a fixed one"
     assert detector.threshold > THRESHOLD
 
 
@@ -155,9 +136,8 @@ def test_two_touched_frames_among_the_first_five_leave_the_threshold() -> None:
 def test_wrenches_and_slip_are_mujocos() -> None:
     env = BeadMaze(BeadMazeConfig(cameras=(), tactile=False))
     env.reset(seed=3)
-    for turn in [0.0] * 11 + [
-        0.004
-    ] * 4:  # rad a tick: across the wire, until the bead slips in the fingers
+    # rad a tick: across the wire, until the bead slips in the fingers
+    for turn in [0.0] * 11 + [0.004] * 4:
         env.step(np.append(np.full(env.n_joints, turn), 0.0))
     model, data = env.model, env.data
     external = np.zeros(6)

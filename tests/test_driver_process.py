@@ -142,9 +142,10 @@ def parent(log: Path, *words: str) -> subprocess.Popen[bytes]:
     return process
 
 
-def test_a_killed_parent_leaves_the_device_at_rest(log: Path) -> None:
+@pytest.mark.parametrize("signal_", [signal.SIGKILL, signal.SIGINT], ids=["killed", "Ctrl-C"])
+def test_a_parent_that_goes_leaves_the_device_at_rest(log: Path, signal_: signal.Signals) -> None:
     process = parent(log)
-    process.send_signal(signal.SIGKILL)
+    process.send_signal(signal_)
     process.wait(20)
     until(lambda: not running(pid(log)))
     assert log.read_text().endswith("at rest\n")
@@ -156,14 +157,6 @@ def test_a_killed_parent_with_a_hung_library_leaves_nothing_running(log: Path) -
     process.send_signal(signal.SIGKILL)
     process.wait(20)
     until(lambda: not running(pid(log)))
-
-
-def test_ctrl_c_is_for_the_parent_alone(log: Path) -> None:
-    process = parent(log)
-    process.send_signal(signal.SIGINT)
-    process.wait(20)
-    until(lambda: not running(pid(log)))
-    assert log.read_text().endswith("at rest\n")
 
 
 @pytest.mark.parametrize(

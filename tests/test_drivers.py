@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,8 @@ from running_twin import RunningTwin
 
 from touchgoal.control.arms import franka, ur
 from touchgoal.control.arms.streaming import ArmConfig, ArmProcess, shift_wrench
-from touchgoal.control.grippers.franka_hand import FrankaHand
-from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
+from touchgoal.control.cell.connection import _gripper, connect_arm
+from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.interfaces import Arm, Camera, DriverError, Gripper, LoadCell
 from touchgoal.control.safety.limits import FR3, UR5E
 from touchgoal.control.sensors.load_cell import SerialLoadCell
@@ -29,16 +30,12 @@ HZ = 20.0
 # A parent that moves the arm and is then killed; its first line of output says that it moves.
 DRIVING = """
 import sys, time
-import numpy as np
-from touchgoal.control.arms import franka
-from touchgoal.control.arms import ur
-from touchgoal.control.arms.streaming import ArmConfig, ArmProcess
-from touchgoal.control.safety.limits import FR3, UR5E
-name, address = sys.argv[1:]
-client, rate, robot = {
-    "fr3": (franka.FrankaClient, franka.RATE, FR3), "ur5e": (ur.UrClient, ur.RATE, UR5E)
-}[name]
-arm = ArmProcess(client, ArmConfig(address, robot, 20.0, rate, 0.5))
+from dataclasses import replace
+from pathlib import Path
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.connection import connect_arm
+cell = read_cell_file(Path(sys.argv[1]))
+arm = connect_arm(replace(cell, safety=replace(cell.safety, state_timeout=0.5)), 20.0)
 q = arm.read().q
 while True:
     q[0] += 0.01
@@ -50,28 +47,17 @@ while True:
 
 
 class Twin(RunningTwin):
-    """A twin in real time, and its driver's parts."""
+    """A twin in real time."""
 
     def __init__(self, name: str, out: Path) -> None:
-        arms = ("fr3", "ur5e")
         blind = ["--env.cameras", "front", "--env.no-tactile"]  # a processor's time
-        super().__init__(["--arm", name, "--seed", "3", *blind], out, 20 + arms.index(name))
-        self.name = name
-        self.client, rate, robot = {
-            "fr3": (franka.FrankaClient, franka.RATE, FR3),
-            "ur5e": (ur.UrClient, ur.RATE, UR5E),
-        }[name]
-        address = self.cell.address
-        self.config = ArmConfig(address, robot, HZ, rate, state_timeout=0.5)
+        number = 20 + ("fr3", "ur5e").index(name)
+        super().__init__(["--arm", name, "--seed", "3", *blind], out, number)
+        self.name, self.robot = name, cell_limits(self.cell)
 
     def connect(self) -> ArmProcess:
-        return ArmProcess(self.client, self.config)
-
-    def gripper(self) -> Gripper:
-        gripper = self.cell.gripper
-        if gripper.kind == "franka_hand":
-            return FrankaHand(gripper.address)
-        return Robotiq(RobotiqConfig(gripper.port, activate=True, widths=gripper.widths))
+        safety = replace(self.cell.safety, state_timeout=0.5)  # on a machine however loaded
+        return connect_arm(replace(self.cell, safety=safety), HZ)
 
 
 @pytest.fixture(scope="module", params=["fr3", "ur5e"])
@@ -106,7 +92,7 @@ def arrives(arm: Arm, target: np.ndarray) -> None:
 
 
 def test_an_arm_reads_fresh_follows_and_rests_at_the_last_target(twin: Twin, arm: Arm) -> None:
-    first, n = arm.read(), twin.config.robot.arm.home.size
+    first, n = arm.read(), twin.robot.arm.home.size
     assert isinstance(arm, Arm) and first.fault == ""
     assert first.q.shape == first.velocity.shape == first.torque.shape == (n,)
     until(lambda: arm.read().stamp > first.stamp)
@@ -181,7 +167,7 @@ def test_a_pressed_stop_is_not_recovered_by_software(twin: Twin, arm: Arm) -> No
     twin.at_rest()
     twin.ask("stop-button off")
     if twin.name == "ur5e":  # it took the power off; a person switches it on at the pendant
-        with socket.create_connection((twin.config.address, 29999), timeout=10) as pendant:
+        with socket.create_connection((twin.cell.address, 29999), timeout=10) as pendant:
             answers = pendant.makefile()
             answers.readline()
             for line in ("power on", "brake release"):
@@ -192,7 +178,7 @@ def test_a_pressed_stop_is_not_recovered_by_software(twin: Twin, arm: Arm) -> No
 
 def test_a_killed_program_leaves_the_arm_at_rest(twin: Twin) -> None:
     parent = subprocess.Popen(
-        [sys.executable, "-c", DRIVING, twin.name, twin.config.address], stdout=subprocess.PIPE
+        [sys.executable, "-c", DRIVING, str(twin.cell_file)], stdout=subprocess.PIPE
     )
     assert parent.stdout and parent.stdout.readline() == b"moves\n"
     parent.kill()
@@ -210,9 +196,9 @@ def rests_at(gripper: Gripper, width: float) -> bool:
 
 
 def test_a_gripper_opens_closes_and_is_clipped_to_its_stroke(twin: Twin) -> None:
-    gripper = twin.gripper()
+    gripper = _gripper(twin.cell)
     assert isinstance(gripper, Gripper)
-    stamp, widest = gripper.read().stamp, twin.config.robot.tool.stroke[1]
+    stamp, widest = gripper.read().stamp, twin.robot.tool.stroke[1]
     for asked, width in ((0.06, 0.06), (0.03, 0.03), (9.0, widest)):
         gripper.command(asked)
         until(lambda w=width: rests_at(gripper, w))
@@ -241,7 +227,8 @@ def test_a_taken_franka_is_said_and_not_waited_for(twin: Twin) -> None:
         pytest.skip("a UR takes several clients")
     arm = twin.connect()
     with pytest.raises(DriverError, match="no other program"):
-        ArmProcess(twin.client, twin.config, connect_timeout=3.0)
+        config = ArmConfig(twin.cell.address, FR3, HZ, franka.RATE, 0.5)
+        ArmProcess(franka.FrankaClient, config, connect_timeout=3.0)
     arm.close()
 
 

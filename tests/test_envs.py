@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import tempfile
 from dataclasses import replace
 from typing import Literal
 
@@ -58,15 +57,11 @@ def test_gymnasium_contract(name: str) -> None:
     env = gym.make(name)
     check_env(env.unwrapped, skip_render_check=True)
     observation, info = env.reset(seed=0)
-    for key, value in observation.items():
+    for key, value in (observation | info).items():
         assert value.shape == ft.FEATURES[key].shape and value.dtype == ft.FEATURES[key].dtype
     truth = {key for key in ft.FEATURES if key.startswith("truth.")}
     of_some_tasks = {ft.TRUTH_FAILURE, ft.TRUTH_START}
     assert truth - of_some_tasks <= info.keys() <= truth
-    for key in info:
-        assert (
-            info[key].shape == ft.FEATURES[key].shape and info[key].dtype == ft.FEATURES[key].dtype
-        )
     env.close()
 
 
@@ -101,9 +96,6 @@ def test_options_by_name() -> None:
     maze = touchgoal.make("bead-maze", tactile=False, randomization={"gain": 0.0})
     assert isinstance(maze, BeadMaze) and not maze.config.tactile
     assert maze.config.randomization == replace(BeadMazeConfig().randomization, gain=0.0)
-    assert isinstance(touchgoal.make("pick-place", render_mode="rgb_array"), PickPlace)
-    with pytest.raises(UserError, match="no option 'camera_sise'; did you mean camera_size"):
-        gym.make("touchgoal/PickPlace-v0", camera_sise=(96, 96))
     with pytest.raises(UserError, match="has no option 'blurr'; did you mean blur"):
         touchgoal.make("pick-place", randomization={"blurr": 0.0})
     with pytest.raises(UserError, match="unknown task 'place'; choose from: pick-place, bead-maze"):
@@ -119,32 +111,19 @@ def test_step_before_reset_says_so() -> None:
             call()
 
 
-@pytest.mark.parametrize("context", ["fork", "forkserver"])
-def test_a_forked_worker_refuses_to_render(context: str) -> None:
-    """In Mesa it would wait for ever if its parent has rendered."""
-    program = f"""
+def test_a_forked_worker_refuses_to_render() -> None:
+    """In Mesa it would wait for ever if its parent has rendered. Not forked: test_for_rl.py."""
+    program = """
 import gymnasium as gym, touchgoal
-
-def make():
-    return gym.make("touchgoal/PickPlace-v0", cameras=("front",), tactile=False)
-
-if __name__ == "__main__":
-    make().reset(seed=0)
-    envs = gym.vector.AsyncVectorEnv([make], context="{context}")
-    print(envs.reset(seed=0)[0]["observation.images.front"].shape, flush=True)
-    envs.close()
+make = lambda: gym.make("touchgoal/PickPlace-v0", cameras=("front",), tactile=False)
+make().reset(seed=0)
+gym.vector.AsyncVectorEnv([make], context="fork").reset(seed=0)
 """
-    with tempfile.NamedTemporaryFile("w", suffix=".py") as file:
-        file.write(program)
-        file.flush()
-        ran = subprocess.run(
-            [sys.executable, file.name], capture_output=True, text=True, timeout=120
-        )
-    if context == "fork":
-        assert ran.returncode != 0 and "UserError: this process was forked" in ran.stderr
-        assert 'context="forkserver"' in ran.stderr
-    else:
-        assert ran.returncode == 0 and "(1, 128, 128, 3)" in ran.stdout, ran.stderr
+    ran = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120
+    )
+    assert ran.returncode != 0 and "UserError: this process was forked" in ran.stderr
+    assert 'context="forkserver"' in ran.stderr
 
 
 @pytest.mark.parametrize("arm", ["fr3", "ur5e"])
@@ -203,6 +182,7 @@ def test_grasp_force_weight_and_creep(blind: PickPlace, name: str, force: float)
     for pad in pads:
         assert pad.normal_force == pytest.approx(force, rel=0.02)
         assert pad.slip_speed < 1e-3
+    np.testing.assert_allclose(blind.external_wrench()[:3], [0, 0, -0.1 * 9.81], atol=0.03)
     weight = sum(pad.force[0] for pad in pads)  # x points down the finger
     assert weight == pytest.approx(0.1 * 9.81, rel=0.02)
 
@@ -214,9 +194,8 @@ def test_a_long_grasp_lets_go_at_once(blind: PickPlace) -> None:
     held = blind.width()
     for _ in range(3):
         blind.step(np.append(STILL[:-1], 0.08))
-    assert (
-        blind.width() - held > 0.5 * 0.15 * 0.1
-    )  # m: at 0.1 m/s for 0.15 s, the pads let go first
+    # At 0.1 m/s for 0.15 s, the pads let go first.
+    assert blind.width() - held > 0.5 * 0.15 * 0.1
 
 
 def test_weak_grasp_loses_a_heavy_object(blind: PickPlace) -> None:
@@ -227,23 +206,11 @@ def test_weak_grasp_loses_a_heavy_object(blind: PickPlace) -> None:
     assert lost < 0.05 < blind.object_pose()[2]
 
 
-def test_external_wrench_is_the_weight(blind: PickPlace) -> None:
-    lift(blind, object="toy_brick", grasp_force=20.0, mass=0.15)
-    observation, *_ = blind.step(STILL)
-    np.testing.assert_allclose(observation[ft.WRENCH][:3], [0, 0, -0.15 * 9.81], atol=0.03)
-
-
 def test_bad_requests_say_what_to_do(blind: PickPlace) -> None:
     with pytest.raises(UserError, match="unknown object 'teapot'; choose from: glass_ball"):
         blind.reset(options={"object": "teapot"})
-    with pytest.raises(
-        UserError, match="PickPlaceReset has no option 'colour'; there are: object, mass"
-    ):
-        blind.reset(options={"colour": "red"})
     with pytest.raises(UserError, match="grasp_force must be less than or equal to 40, not 500"):
         blind.reset(options={"grasp_force": 500})
-    with pytest.raises(UserError, match="cameras must be 'front' or 'wrist', not top"):
-        PickPlaceConfig(cameras=("top",))  # pyright: ignore[reportArgumentType]
     blind.reset(seed=0)
     with pytest.raises(UserError, match="needs a second object"):
         PickPlaceExpert(blind, "wrong_object")

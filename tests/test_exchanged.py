@@ -9,16 +9,15 @@ import cv2
 import mujoco
 import numpy as np
 import pytest
-from fake_cell import FakeArm, FakeCamera, FakeClock, FakeGripper
+from fake_cell import SIM, FakeArm, FakeCamera, FakeCell, write_cell_file
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
-from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import ControlLoop
 from touchgoal.control.deployment.preflight import preflight
 from touchgoal.control.deployment.scripted import ScriptedActor
 from touchgoal.control.deployment.session import Session
-from touchgoal.control.interfaces import Camera, Frame
+from touchgoal.control.interfaces import Frame
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.sensors.exchanged import cameras_exchanged, fingertips_exchanged
@@ -53,29 +52,20 @@ def test_exchanged_fingertips_are_noticed_at_every_start() -> None:
 
 
 def preflighted(
-    pictures: list[np.ndarray], untouched: list[np.ndarray], tmp_path: Path
+    pictures: list[np.ndarray], untouched: list[np.ndarray], folder: Path
 ) -> dict[str, CheckResult]:
     """The pre-flight's lines on two fingertips that show these, each with a sensor file of its own."""
-    clock, folders = FakeClock(), []
-    for side, background in enumerate(untouched):
-        folders.append(tmp_path / f"finger_{side}")
-        tmp_path.mkdir(exist_ok=True)
-        shutil.copytree(GELSIGHT_MINI.sensor_file, folders[-1])
-        cv2.imwrite(str(folders[-1] / "background.png"), background[..., ::-1])
-    file = tmp_path / "cell.toml"
-    file.write_text(
-        'arm = "sim"\ngripper = { kind = "franka_hand" }\n[fingertips]\n'
-        'sensor = "gelsight_mini"\nleft = "http://left"\nright = "http://right"\n'
-        f"sensor_files = {[str(folder) for folder in folders]}\n"
-        '[task]\nname = "pick-place"\npolicy = "expert"\n'
-    )
-    cameras: dict[str, Camera] = {
-        key: TactileCamera(FakeCamera(clock, picture), find_sensor(str(folder)), NO_CROP)
-        for key, picture, folder in zip(ft.TACTILE, pictures, folders, strict=True)
-    }
-    connection = CellConnection(FR3, FakeArm(clock), FakeGripper(clock), cameras, None, clock)
+    cell, files = FakeCell(), []
+    for key, picture, background in zip(ft.TACTILE, pictures, untouched, strict=True):
+        files.append(str(folder / key))
+        shutil.copytree(GELSIGHT_MINI.sensor_file, files[-1])
+        cv2.imwrite(f"{files[-1]}/background.png", background[..., ::-1])
+        camera = FakeCamera(cell.clock, picture)
+        cell.cameras[key] = TactileCamera(camera, find_sensor(files[-1]), NO_CROP)
+    tips = 'fingertips = { sensor = "gelsight_mini", left = "http://l", right = "http://r", '
+    file = write_cell_file(folder, f"{tips}sensor_files = {files} }}\n{SIM}")
     safety = ActionFilter(FR3, ft.CONTROL_HZ)
-    lines = preflight(read_cell_file(file), connection, safety, tmp_path / "episodes", lambda: 0)
+    lines = preflight(read_cell_file(file), cell.connection(), safety, folder, lambda: 0)
     return {line.name: line for line in lines}
 
 
@@ -148,33 +138,18 @@ def test_a_run_with_exchanged_cameras_ends_after_the_start_move(
     exchanged: bool, tmp_path: Path
 ) -> None:
     start = FR3.arm.home + np.array([0.3, *[0.0] * 6])
-    file = tmp_path / "cell.toml"
-    file.write_text(
-        'arm = "sim"\ngripper = { kind = "franka_hand" }\n'
-        f'task = {{ name = "pick-place", policy = "expert", start = {start.tolist()} }}\n'
-    )
-    clock, scene = FakeClock(), np.random.default_rng(0).integers(0, 255, (128, 128, 3), np.uint8)
-    arm = FakeArm(clock)
-    fixed, carried = FakeCamera(clock, scene), CameraOnTheArm(clock, scene, arm=arm)
+    text = SIM.replace("seed = 3", f"start = {start.tolist()}")
+    cell, scene = FakeCell(), np.random.default_rng(0).integers(0, 255, (128, 128, 3), np.uint8)
+    fixed = FakeCamera(cell.clock, scene)
+    carried = CameraOnTheArm(cell.clock, scene, arm=cell.arm)
     views = (carried, fixed) if exchanged else (fixed, carried)
-    cameras: dict[str, Camera] = dict(zip(ft.CAMERAS, views, strict=True))
-    connection = CellConnection(FR3, arm, FakeGripper(clock), cameras, None, clock)
+    cell.cameras = dict(zip(ft.CAMERAS, views, strict=True))
 
     def actor(loop: ControlLoop) -> ScriptedActor:
         return ScriptedActor([], loop.commanded, ft.CONTROL_HZ)
 
-    ending = (
-        Session(
-            read_cell_file(file),
-            connection,
-            ActionFilter(FR3, ft.CONTROL_HZ),
-            lambda *_: 0,
-            True,
-            actor,
-            lambda: "",
-            lambda _: None,
-        )
-        .run()
-        .ending
-    )
+    config, safety = read_cell_file(write_cell_file(tmp_path, text)), ActionFilter(FR3, 20)
+    nobody = lambda: "", lambda _: None  # asks, or is told
+    session = Session(config, cell.connection(), safety, lambda *_: 0, True, actor, *nobody)
+    ending = session.run().ending
     assert ending.stopped == exchanged and ("look exchanged" in ending.reason) == exchanged

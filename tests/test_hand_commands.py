@@ -108,19 +108,21 @@ def simulated(wanted: list[float], between: float) -> np.ndarray:
     return np.array(widths)
 
 
-SEQUENCES = {
-    "passes": [OPEN, 0.03, OPEN, OPEN, OPEN, OPEN],
-    "goes on passing": [OPEN, 0.07, 0.06, 0.05, 0.04, 0.03, *[0.02] * 20],
-    "stays": [OPEN, *[0.03] * 12, *[OPEN] * 20],
-    "a move meets something": [OPEN, *[0.03] * 20, 0.02, 0.02, 0.02, *[0.07] * 10],
-    "a grasp goes on": [OPEN, *[0.0] * 20, *[0.01] * 5, *[0.03] * 5, *[OPEN] * 20],
-}
-COMMANDS = {
-    "passes": [],
-    "goes on passing": [("move", 0.04), ("move", 0.02)],
-    "stays": [("move", 0.03), ("move", 0.08)],
-    "a move meets something": [("move", 0.03), ("grasp", 0.0), ("move", 0.07)],
-    "a grasp goes on": [("grasp", 0.0), ("move", 0.08)],
+SEQUENCES = {  # widths that are asked for, and the commands that they make
+    "passes": ([OPEN, 0.03, OPEN, OPEN, OPEN, OPEN], []),
+    "goes on passing": (
+        [OPEN, 0.07, 0.06, 0.05, 0.04, 0.03, *[0.02] * 20],
+        [("move", 0.04), ("move", 0.02)],
+    ),
+    "stays": ([OPEN, *[0.03] * 12, *[OPEN] * 20], [("move", 0.03), ("move", 0.08)]),
+    "a move meets something": (
+        [OPEN, *[0.03] * 20, 0.02, 0.02, 0.02, *[0.07] * 10],
+        [("move", 0.03), ("grasp", 0.0), ("move", 0.07)],
+    ),
+    "a grasp goes on": (
+        [OPEN, *[0.0] * 20, *[0.01] * 5, *[0.03] * 5, *[OPEN] * 20],
+        [("grasp", 0.0), ("move", 0.08)],
+    ),
 }
 
 
@@ -128,10 +130,10 @@ COMMANDS = {
 def test_driver_and_environment_send_these_commands(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    between = 0.04 if name.startswith("a ") else 0.0
-    widths, commands = driven(monkeypatch, SEQUENCES[name], between)
-    assert commands == COMMANDS[name]
-    np.testing.assert_array_equal(simulated(SEQUENCES[name], between), widths)
+    (wanted, expected), between = SEQUENCES[name], 0.04 if name.startswith("a ") else 0.0
+    widths, commands = driven(monkeypatch, wanted, between)
+    assert commands == expected
+    np.testing.assert_array_equal(simulated(wanted, between), widths)
 
 
 def test_driver_and_environment_do_the_same_whatever_is_asked(

@@ -23,6 +23,8 @@ from touchgoal.sim_envs.scene.build import SceneConfig, build
 if TYPE_CHECKING:
     import mujoco
 
+UR5E = Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)
+BOTH_ARMS = pytest.mark.parametrize("arm", [Fr3Kinematics(), UR5E], ids=["FR3", "UR5e"])
 POSES = 1000
 NEAR = 0.2  # rad, farthest that a joint is from the solution at the start
 _EDGE = 0.05  # rad from its limit in which a joint counts as near it
@@ -81,7 +83,7 @@ def test_fr3_matches_mujoco() -> None:
 
 def test_at_a_singularity_the_joints_change_little() -> None:
     """A UR5e with its wrist stretched, asked for what no change of its joints gives."""
-    arm = Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)
+    arm = UR5E
     stretched = arm.arm.home * [1, 1, 1, 1, 0, 1] + [0, 0, 0, 0, 1e-6, 0]
     lost = np.linalg.svd(arm.jacobian(stretched))[0][:, -1]  # direction of the least displacement
     assert np.abs(np.linalg.pinv(arm.jacobian(stretched)) @ (1e-3 * lost)).max() > 100
@@ -98,33 +100,6 @@ def test_rotation_vector_inverts_rodrigues(angle: float) -> None:
     axis = np.array([2.0, -1.0, 0.5]) / np.linalg.norm([2.0, -1.0, 0.5])
     found = rotation_vector(rotation_matrix(angle * axis))
     assert min(np.linalg.norm(found - angle * axis), np.linalg.norm(found + angle * axis)) < 1e-5
-
-
-def _ur5e_in_mujoco() -> "mujoco.MjModel":
-    """The UR5e from its lengths, joint by joint along the controller's base frame at q = 0.
-
-    Written from the drawing (axis directions and distances), not from DH frames.
-    """
-    import mujoco
-
-    axes = [(0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1), (0, -1, 0)]
-    offsets = [
-        (0, 0, 0),
-        (0, 0, 0.1625),
-        (-0.425, 0, 0),
-        (-0.3922, 0, 0),
-        (0, -0.1333, 0),
-        (0, 0, -0.0997),
-    ]
-    spec = mujoco.MjSpec()
-    body = spec.worldbody
-    for i, (axis, offset) in enumerate(zip(axes, offsets, strict=True)):
-        body = body.add_body(pos=offset)
-        body.add_joint(name=f"joint_{i}", axis=axis)
-        body.add_geom(size=[0.01, 0, 0], mass=1.0)
-    flange = body.add_site(name="flange", pos=[0, -0.0996, 0])
-    flange.quat = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])  # z out of the flange, along -y
-    return spec.compile()
 
 
 def test_the_simulated_ur5e_is_the_makers() -> None:
@@ -151,17 +126,11 @@ def test_the_simulated_ur5e_is_the_makers() -> None:
     assert model.site("tcp").pos[2] == pytest.approx(0.0108 + 0.1628 - 0.01875)
     assert 2 * model.joint("finger_joint1").range[1] == pytest.approx(0.085)
     dofs = [int(model.joint(f"ur5e_joint{i}").dofadr[0]) for i in range(1, 7)]
-    check_against_mujoco(model, Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset), "tcp", dofs)
-
-
-def test_ur5e_matches_mujoco() -> None:
-    check_against_mujoco(_ur5e_in_mujoco(), Kinematics(UR5E_ARM, 0.0), "flange", list(range(6)))
+    check_against_mujoco(model, UR5E, "tcp", dofs)
 
 
 @pytest.mark.parametrize("posture", [0.02, 0.0])
-@pytest.mark.parametrize(
-    "arm", [Fr3Kinematics(), Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)], ids=["FR3", "UR5e"]
-)
+@BOTH_ARMS
 def test_near_poses_are_reached_near_limits_and_singularities_too(
     arm: Kinematics, posture: float
 ) -> None:
@@ -180,9 +149,7 @@ def test_near_poses_are_reached_near_limits_and_singularities_too(
     assert reached >= 0.99 * 2000
 
 
-@pytest.mark.parametrize(
-    "arm", [Fr3Kinematics(), Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)], ids=["FR3", "UR5e"]
-)
+@BOTH_ARMS
 def test_what_is_reachable_is_reached_in_any_orientation(arm: Kinematics) -> None:
     """999 of 1000 poses that some joint positions have, inside the box over the table."""
     rng, limits, home = np.random.default_rng(7), arm.arm.limits, arm.arm.home

@@ -35,6 +35,9 @@ from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 Frame = np.ndarray
 SENSORS = ("gelsight_mini", "gelsight_mini_markers", "digit", "gelsight")
 DIM = np.array([0.85, 0.8, 0.9])
+MINI = load(GELSIGHT_MINI.sensor_file)
+WHITENED = preprocessor_for("gelsight_mini", 3)
+DEPTH = DepthEstimator(MINI, 8)
 
 
 def touches(sensor: SensorModel, seed: int, radius: float = 4e-3) -> tuple[Frame, Frame, float]:
@@ -95,29 +98,15 @@ def followed_indentation(frame: Frame, rest: Frame) -> np.ndarray:
 READERS: dict[str, Callable[[Frame, Frame], np.ndarray]] = {
     "contact strength": lambda frame, rest: contact_strength(frame[None], rest),
     "contact detector": detector_strength,
-    "depth": lambda frame, rest: (
-        1e3
-        * DepthEstimator(load(GELSIGHT_MINI.sensor_file), 8).estimate(
-            frame, rest.astype(np.float32)
-        )
-    ),
+    "depth": lambda frame, rest: 1e3 * DEPTH.estimate(frame, rest.astype(np.float32)),
     "indentation": followed_indentation,
     "unexplained share": lambda frame, rest: np.array(
-        [
-            explain(
-                DepthEstimator(load(GELSIGHT_MINI.sensor_file), 8),
-                load(GELSIGHT_MINI.sensor_file),
-                frame,
-                rest.astype(np.float32),
-            ).unexplained
-        ]
+        [explain(DEPTH, MINI, frame, rest.astype(np.float32)).unexplained]
     ),
     "ball": find_circle,
     "force": lambda frame, rest: change_statistics(frame, rest.astype(np.float32)),
     "encoders": lambda frame, rest: preprocessor_for("gelsight_mini")(frame[None], rest),
-    "whitened encoders": lambda frame, rest: preprocessor_for("gelsight_mini", 3)(
-        frame[None], rest
-    ),
+    "whitened encoders": lambda frame, rest: WHITENED(frame[None], rest),
     "end to end": lambda frame, rest: (
         difference_images(frame[None], rest, (60, 80)).astype(float) - 128
     ),

@@ -6,16 +6,16 @@ documents, without our kinematics.
 """
 
 import time
+from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from running_twin import RunningTwin, client
 
 from touchgoal.control.arms import franka
-from touchgoal.control.arms.streaming import ArmConfig, ArmProcess
-from touchgoal.control.arms.ur import RATE as UR_RATE
-from touchgoal.control.arms.ur import UrClient
-from touchgoal.control.safety.limits import FR3, UR5E
+from touchgoal.control.cell.connection import connect_arm
+from touchgoal.control.safety.limits import UR5E
 from touchgoal.sim_envs.twin.franka.limits import estimate_sent
 
 PUSH = np.array([6.0, -8.0, 5.0])  # N, of the environment on the hand
@@ -154,19 +154,13 @@ def test_drivers_say_what_the_environment_does_to_the_robot(
     """And a UR's sensor is zeroed at the start, so that what already presses then is not felt."""
     twin: RunningTwin = request.getfixturevalue(name)
     twin.begin("reset 3")
-    kind, rate, robot = {
-        "fr3": (franka.FrankaClient, franka.RATE, FR3),
-        "ur5e": (UrClient, UR_RATE, UR5E),
-    }[name]
-    arm = ArmProcess(kind, ArmConfig(twin.cell.address, robot, 20.0, rate, 1.0))
-    try:
+    safety = replace(twin.cell.safety, state_timeout=1.0)
+    with closing(connect_arm(replace(twin.cell, lock_step=False, safety=safety), 20.0)) as arm:
         before = arm.read()
         twin.ask("nudge {} {} {} 600".format(*PUSH))
         twin_time = twin.ask("truth")["time"]
         while twin.ask("truth")["time"] < twin_time + 0.3:
             pass
         pushed = arm.read()
-        np.testing.assert_allclose((pushed.wrench - before.wrench)[:3], PUSH, atol=0.5)
-    finally:
         twin.ask("nudge 0 0 0 0")
-        arm.close()
+    np.testing.assert_allclose((pushed.wrench - before.wrench)[:3], PUSH, atol=0.5)

@@ -1,7 +1,6 @@
 """Frames of a sensor from any source, presses recorded from them, and the sensor checked."""
 
 import threading
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -20,36 +19,35 @@ from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.config import NO_RANDOMIZATION
+from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
-from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
+from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
 BALL = Surface("ball", 4e-3, 1.0, np.zeros((TILE, TILE), np.float32), 1.0)
 RNG = np.random.default_rng(0)
 UNIT = sample_instance(GELSIGHT_MINI, RNG)
 
 
-def centres(unit: SensorInstance) -> list[tuple[float, float]]:
-    """Return one ball centre for each part of the picture, px from the middle."""
-    return [(x, y) for y in (-75, 0, 75) for x in (-110, -40, 40, 110)]
+CENTRES = [(x, y) for y in (-75, 0, 75) for x in (-110, -40, 40, 110)]  # px from the middle
 
 
-def pressing(unit: SensorInstance, at: tuple[float, float]) -> Iterator[np.ndarray]:
-    """Frames of a ball that comes, stands for a fifth of a second, and goes."""
-    x, y = (pixels * unit.pixel_pitch for pixels in at)
-    for depth in (0.15, 0.4, *[0.6] * 6, 0.3):
-        pose = SurfacePose((x, y), 0.0, (0.0, 0.0), (0.0, 0.0), depth * 1e-3)
-        yield press(BALL, pose, unit, RNG)
-    for _ in range(4):
-        yield render_untouched(unit, RNG)
+def pressed(x: float, y: float, depth: float) -> np.ndarray:
+    """A ball at a place (px from the middle), so deep (mm) in the gel."""
+    at = x * UNIT.pixel_pitch, y * UNIT.pixel_pitch
+    return press(BALL, SurfacePose(at, 0.0, (0.0, 0.0), (0.0, 0.0), depth * 1e-3), UNIT, RNG)
 
 
 @pytest.fixture(scope="module")
 def session() -> list[np.ndarray]:
-    """A whole recording: a settled gel, then a press in each part."""
+    """A settled gel; in each part a ball comes, stands for a fifth of a second, and goes."""
     frames = [render_untouched(UNIT, RNG) for _ in range(30)]
-    return frames + [frame for at in centres(UNIT) for frame in pressing(UNIT, at)]
+    for x, y in CENTRES:
+        frames += [pressed(x, y, depth) for depth in (0.15, 0.4, *[0.6] * 6, 0.3)]
+        frames += [render_untouched(UNIT, RNG) for _ in range(4)]
+    return frames
 
 
 def test_every_press_is_kept_once_where_it_was(session: list[np.ndarray]) -> None:
@@ -57,16 +55,14 @@ def test_every_press_is_kept_once_where_it_was(session: list[np.ndarray]) -> Non
     kept = [recorder.update(frame) for frame in session]
     assert recorder.complete and sum(kept) == 12
     found = np.array(recorder.circles)[:, :2] - [159.5, 119.5]
-    assert (
-        np.abs(found - centres(UNIT)).max() < 10
-    )  # px: within the contact, the fit moves it further
+    off = np.abs(found - CENTRES).max()
+    assert off < 10  # px: within the contact, the fit moves it further
     assert (recorder.counts == 1).all()
 
 
 def test_a_gel_that_is_touched_first_is_waited_for(session: list[np.ndarray]) -> None:
     recorder = PressRecorder((240, 320))
-    for frame in session[30:39]:
-        assert not recorder.update(frame)
+    assert not any(recorder.update(frame) for frame in session[30:39])
     assert "untouched" in recorder.hint
     with pytest.raises(UserError, match="untouched"):
         _ = recorder.background
@@ -80,8 +76,7 @@ def test_a_press_that_never_stands_still_is_not_kept(session: list[np.ndarray]) 
     for frame in session[:30]:
         recorder.update(frame)
     for x in range(-60, 60, 8):
-        pose = SurfacePose((x * UNIT.pixel_pitch, 0.0), 0.0, (0.0, 0.0), (0.0, 0.0), 0.4e-3)
-        assert not recorder.update(press(BALL, pose, UNIT, RNG))
+        assert not recorder.update(pressed(x, 0.0, 0.4))
     assert recorder.hint == "hold still"
 
 
@@ -178,14 +173,10 @@ def test_check_sensor_says_what_is_off(
 
 
 def test_a_sensor_check_counts_markers() -> None:
-    frames = []
-    for moved in (0.0, 0.0, 3.0):
-        frame = render_untouched(UNIT, RNG)
-        for row, column in np.ndindex(7, 9):
-            at = 160 + 31.9 * (column - 4) + moved, 120 + 31.9 * (row - 3)
-            fixed = round(16 * at[0]), round(16 * at[1])
-            cv2.circle(frame, fixed, 8 * 16, (20, 20, 20), -1, cv2.LINE_AA, shift=4)
-        frames.append(frame)
+    unit = sample_instance(GELSIGHT_MINI_MARKERS, np.random.default_rng(0), NO_RANDOMIZATION)
+    frames = [render_untouched(unit, RNG) for _ in range(3)]
+    for frame, moved in zip(frames, (0.0, 0.0, 3.0), strict=True):
+        draw(frame, unit.markers + np.array([moved, 0], np.float32), unit.marker_radius)
     check = check_sensor(frames, GELSIGHT_MINI_MARKERS)
     assert check.markers == pytest.approx(1, abs=0.02)
     assert check.largest_shift_px == pytest.approx(3, abs=0.5)

@@ -12,7 +12,7 @@ from toy_episodes import FPS, make_episode
 
 import touchgoal
 from touchgoal.control.calibration.ball import press_surface
-from touchgoal.control.features import TACTILE_LEFT, TACTILE_RIGHT
+from touchgoal.control.features import TACTILE
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.sensors.tactile_camera import NO_CROP, TactileCamera
 from touchgoal.control.tactile.picture_guard import check_presses, check_untouched
@@ -156,23 +156,16 @@ def test_a_set_in_which_the_fingertips_change_places_is_refused(tmp_path: Path) 
     rng = np.random.default_rng(0)
     units = [sample_instance(GELSIGHT_MINI, rng) for _ in range(2)]
 
-    def tips(sides: tuple[int, ...]) -> dict[str, np.ndarray]:
-        pictures = [np.stack([render_untouched(units[s], rng) for _ in range(3)]) for s in sides]
-        return dict(zip((TACTILE_LEFT, TACTILE_RIGHT), pictures, strict=True))
-
-    for name, second in (("right", (0, 1)), ("wrong", (1, 0))):
-        root = tmp_path / name
-        writer = EpisodeWriter(root, FPS)
-        for sides in ((0, 1), second):
-            episode = make_episode(0, 3)
-            episode.frames.update(tips(sides))
-            episode.meta["sensor"] = "gelsight_mini"
-            writer.append(episode)
-        if name == "right":
-            check_fingertips(EpisodeSet(root), range(2))
-        else:
-            with pytest.raises(UserError, match="episode 1 look exchanged"):
-                check_fingertips(EpisodeSet(root), range(2))
+    writer = EpisodeWriter(tmp_path, FPS)
+    for sides in ((0, 1), (0, 1), (1, 0)):
+        episode = make_episode(0, 3)
+        for key, side in zip(TACTILE, sides, strict=True):
+            episode.frames[key] = np.stack([render_untouched(units[side], rng) for _ in range(3)])
+        episode.meta["sensor"] = "gelsight_mini"
+        writer.append(episode)
+    check_fingertips(EpisodeSet(tmp_path), range(2))
+    with pytest.raises(UserError, match="episode 2 look exchanged"):
+        check_fingertips(EpisodeSet(tmp_path), range(3))
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="real frames are not part of the repository")

@@ -28,6 +28,7 @@ from touchgoal.runtime.errors import UserError
 HZ = 20
 TICKS = int(os.environ.get("TOUCHGOAL_SAFETY_TICKS", "400"))
 LAYERS = {robot.arm.name: ActionFilter(robot, HZ) for robot in (robots.FR3, robots.UR5E)}
+BOTH_ROBOTS = pytest.mark.parametrize("robot", [robots.FR3, robots.UR5E], ids=lambda r: r.arm.name)
 EPS = 1e-9
 
 
@@ -107,7 +108,7 @@ def test_nothing_leaves_the_limits_in_a_long_random_walk(name: str) -> None:
     assert {Limit.STEP, Limit.VELOCITY, Limit.ACCELERATION, Limit.WORKSPACE} <= seen
 
 
-@pytest.mark.parametrize("robot", [robots.FR3, robots.UR5E], ids=lambda r: r.arm.name)
+@BOTH_ROBOTS
 def test_eight_corners_of_the_fingertips_are_watched_5_mm_above_the_table(
     robot: RobotLimits,
 ) -> None:
@@ -124,7 +125,7 @@ def test_eight_corners_of_the_fingertips_are_watched_5_mm_above_the_table(
         assert np.linalg.norm(points[1:] - outer, axis=1).min() < 2e-3
 
 
-@pytest.mark.parametrize("robot", [robots.FR3, robots.UR5E], ids=lambda r: r.arm.name)
+@BOTH_ROBOTS
 def test_fingertips_keep_to_their_speed(robot: RobotLimits) -> None:
     layer = ActionFilter(replace(robot, tip_speed=0.1), HZ)
     n, named = robot.arm.home.size, set()
@@ -209,7 +210,7 @@ def test_actions_that_are_no_numbers_hold_then_stop() -> None:
     assert state.fault and state.fault.limit is Limit.NOT_A_NUMBER
 
 
-@pytest.mark.parametrize("robot", [robots.FR3, robots.UR5E], ids=lambda r: r.arm.name)
+@BOTH_ROBOTS
 def test_no_start_outside(robot: RobotLimits) -> None:
     layer = LAYERS[robot.arm.name]
     with pytest.raises(UserError, match="joint 3"):

@@ -89,9 +89,11 @@ def test_how_many_garbled_lines_are_believed(checksum: Checksum, believed: int) 
 
 
 def test_the_checksums_are_the_usual_ones() -> None:
-    """The check value of CRC-16/MODBUS, and a sentence of the NMEA standard."""
+    """CRC-16/MODBUS' check value; a sentence of NMEA's standard; examples of the gripper's manual."""
     assert with_checksum(b"123456789", "crc16") == b"123456789*4B37"
     assert with_checksum(b"GPGLL,5300.97914,N,00259.98174,E,125926,A", "xor").endswith(b"*28")
+    assert modbus_crc(bytes.fromhex("091003E8000306000000000000")) == bytes.fromhex("7330")
+    assert modbus_crc(bytes.fromhex("090407D00003")) == bytes.fromhex("B1CE")
 
 
 def test_what_a_poor_cable_brings_is_counted(line: tuple[int, str]) -> None:
@@ -199,12 +201,6 @@ class Gripper2F85(threading.Thread):
             if self.position >= self.block:
                 self.position, contact = self.block, 2
         return bytes([status | contact << 6, 0, self.fault, wanted, self.position, 0])
-
-
-def test_the_check_is_that_of_the_grippers_manual() -> None:
-    """The manual's examples: clear the activation, read the status while active."""
-    assert modbus_crc(bytes.fromhex("091003E8000306000000000000")) == bytes.fromhex("7330")
-    assert modbus_crc(bytes.fromhex("090407D00003")) == bytes.fromhex("B1CE")
 
 
 def test_the_robotiq_opens_closes_and_holds(line: tuple[int, str]) -> None:

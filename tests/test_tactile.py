@@ -12,7 +12,7 @@ from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI as MINI
 from touchgoal.encoders.pretrained import load_encoder, save
 from touchgoal.encoders.whitening.covariance import inverse_square_root
 from touchgoal.encoders.whitening.simulated_surfaces import WhiteningConfig, train
-from touchgoal.sim_envs.config import NO_RANDOMIZATION, PickPlaceConfig, SensorRandomization
+from touchgoal.sim_envs.config import NO_RANDOMIZATION, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
@@ -28,11 +28,7 @@ from touchgoal.sim_envs.tactile.geometry import (
 from touchgoal.sim_envs.tactile.optics import colour_change, render, render_untouched
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
-from touchgoal.sim_envs.tactile.rig.surface_press import (
-    SurfacePose,
-    overlap,
-    press,
-)
+from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, overlap, press
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface, random_surface
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
@@ -163,13 +159,13 @@ def test_softer_objects_press_wider_and_shallower() -> None:
 
 
 @pytest.mark.parametrize("at", [[0.0125, 0, 0.01], [0.03, 0, 0.01], [0, 0, -0.02], [0, 0, 0.03]])
-@pytest.mark.parametrize("force", [1e-3, 500.0])
 @pytest.mark.parametrize("half", [0.0004, 0.01, 0.05])  # m: smaller and larger than the gel
-def test_degenerate_contacts_stay_finite(at: list[float], force: float, half: float) -> None:
+def test_degenerate_contacts_stay_finite(at: list[float], half: float) -> None:
     """At the gel's edge, beside it, far too deep, out of reach, pressed beyond any gripper."""
-    frame = sense(Body(CATALOGUE["brick"], (half, half, half), 0.1), np.array(at), force)
-    assert np.isfinite(frame.depth).all() and frame.depth.min() > -1e-4
-    assert frame.field is not None and np.isfinite(frame.field.wrench()).all()
+    for force in (1e-3, 500.0):
+        frame = sense(Body(CATALOGUE["brick"], (half, half, half), 0.1), at, force)
+        assert np.isfinite(frame.depth).all() and frame.depth.min() > -1e-4
+        assert frame.field is not None and np.isfinite(frame.field.wrench()).all()
 
 
 def test_same_seed_same_sensor() -> None:
@@ -179,16 +175,6 @@ def test_same_seed_same_sensor() -> None:
     assert (one.background != other.background).mean() > 0.5
     assert one.pixel_pitch != other.pixel_pitch
     assert MINI.pitch_range[0] <= other.pixel_pitch <= MINI.pitch_range[1]
-
-
-def test_turned_lights_turn_the_response() -> None:
-    """A unit's lights stand within the spread of the model's; the response's size stays."""
-    typical, randomization = INSTANCE.calibration, SensorRandomization()
-    for seed in range(5):
-        instance = sample_instance(MINI, np.random.default_rng(seed)).calibration
-        was, now = (p.response[:, 0, 0] + 1j * p.response[:, 1, 0] for p in (typical, instance))
-        assert np.abs(np.angle(now / was, deg=True)).max() <= randomization.azimuth
-        assert np.abs(np.abs(now / was) - 1).max() < 5 * randomization.gain
 
 
 @pytest.mark.parametrize("sensor", [GELSIGHT, DIGIT], ids=lambda s: s.name)
@@ -219,15 +205,10 @@ def test_shadows_fall_opposite_the_bright_sides(sensor: SensorModel, largest_tur
 
 
 def test_untouched_sensor_shows_only_noise() -> None:
-    env = PickPlace(PickPlaceConfig(cameras=()))
-    env.reset(seed=0)
-    frames = [env.step(np.append(np.zeros(7), 0.08))[0] for _ in range(3)]
-    images = np.stack([f["observation.images.tactile_left"] for f in frames]).astype(float)
-    seen = (images[1] - images[0]).std() / np.sqrt(2)
+    rng = np.random.default_rng(0)
+    first, second = (render_untouched(INSTANCE, rng).astype(float) for _ in range(2))
     noise = load(MINI.sensor_file).noise  # of which the darkest colours lose some, cut off at 0
-    assert 0.7 * noise < seen < 1.1 * noise
-    assert not env.tactile_frames[0].mask.any()
-    env.close()
+    assert 0.7 * noise < (second - first).std() / np.sqrt(2) < 1.1 * noise
 
 
 def test_grasp_shows_on_both_pads_with_the_commanded_force() -> None:
@@ -288,18 +269,6 @@ def test_an_encoder_fitted_to_surfaces_comes_back(tmp_path: Path) -> None:
     embedded = loaded.embed(frames)
     assert np.linalg.norm(embedded[1]) == pytest.approx(1, abs=0.02)
     np.testing.assert_allclose(embedded, encoder.embed(frames), atol=1e-4)
-
-
-def test_the_shipped_one_loads_and_takes_the_light_out() -> None:
-    rng = np.random.default_rng(0)
-    unit = sample_instance(GELSIGHT_MINI, rng)
-    rest = render_untouched(unit, rng)
-    frame = press(Surface("ball", 5e-3, 1.0, SMOOTH, 1.0), LEVEL, unit, rng)
-    lit = np.rint(frame * 1.1).clip(0, 255).astype(np.uint8)
-    steady, brighter, other = load_encoder("gelsight_mini").embed(
-        np.stack([frame, lit, press(random_surface(rng), LEVEL, unit, rng)]), rest
-    )
-    assert np.linalg.norm(brighter - steady) < 0.7 * np.linalg.norm(other - steady)
 
 
 def test_light_on_an_untouched_gel_is_no_touch() -> None:

@@ -10,9 +10,7 @@ from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.tactile.forces import ForceField, force_field
 from touchgoal.sim_envs.tactile.geometry import NO_SURFACE, Grid
 from touchgoal.sim_envs.tactile.markers import (
-    DARKNESS,
     GelMotion,
-    draw,
     layer_compliance,
     rest_positions,
 )
@@ -156,14 +154,9 @@ def test_layer_gives_way_as_the_equations_of_elasticity_say(k: float) -> None:
 
     def f(z: float, n: int = 0) -> np.ndarray:
         up, down = np.exp(k * z), np.exp(-k * z)
-        return np.array(
-            [
-                k**n * up,
-                (n * k ** max(n - 1, 0) + k**n * z) * up,
-                (-k) ** n * down,
-                (n * (-k) ** max(n - 1, 0) + (-k) ** n * z) * down,
-            ]
-        )
+        rising, falling = n * k ** max(n - 1, 0), n * (-k) ** max(n - 1, 0)
+        growing = [k**n * up, (rising + k**n * z) * up]
+        return np.array([*growing, (-k) ** n * down, (falling + (-k) ** n * z) * down])
 
     held, sideways = f(-t), f(-t, 1)
     traction = shear * (f(0, 2) / k + k * f(0))  # times i
@@ -222,24 +215,9 @@ def test_the_gel_piles_up_in_front_of_what_is_drawn_over_it() -> None:
     assert not held.any()
 
 
-def test_markers_rest_inside_the_image_and_are_drawn_where_they_are() -> None:
+def test_markers_rest_inside_the_image() -> None:
     assert MINI.markers is not None
     rest = rest_positions(MINI.markers, (240, 320), MINI.pixel_pitch)
     assert len(rest) == 63
     np.testing.assert_allclose(rest.mean(0), [159.5, 119.5], atol=1e-3)
-    cropped = rest_positions(MINI.markers, (240, 250), MINI.pixel_pitch)
-    assert len(cropped) == 7 * 7
-    rng = np.random.default_rng(0)
-    y, x = np.mgrid[0:60, 0:60]
-    for _ in range(20):
-        centre = rng.uniform(20, 40, 2).astype(np.float32)
-        image = np.full((60, 60, 3), 140, np.uint8)
-        draw(image, centre[None], 7.5)
-        ink = 140.0 - image[..., 1]
-        found = np.array([(ink * x).sum(), (ink * y).sum()]) / ink.sum()
-        assert np.abs(found - centre).max() < 0.05
-        assert ink.sum() / (140 * DARKNESS) == pytest.approx(np.pi * 7.5**2, rel=0.02)
-    image = np.full((60, 60, 3), 140, np.uint8)
-    draw(image, np.array([[-3, 30], [500, -500]], np.float32), 7.5)
-    inked = np.any(image < 140, axis=(0, 2))
-    assert inked[:4].all() and not inked[6:].any()
+    assert len(rest_positions(MINI.markers, (240, 250), MINI.pixel_pitch)) == 7 * 7

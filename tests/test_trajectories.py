@@ -28,24 +28,26 @@ ROBOTS = [
 ]
 
 
-def peak_shares(trajectory: Trajectory, limits: JointLimits) -> np.ndarray:
-    """Peaks of speed, acceleration and jerk at 1 kHz, rest before and after, over their limits."""
-    t = np.arange(-5, int(1e3 * trajectory.duration) + 6) * 1e-3
-    q = trajectory.at(t)
+BOTH = pytest.mark.parametrize(("robot", "arm"), ROBOTS, ids=["FR3", "UR5e"])
+DT = 1e-3
+
+
+def peak_shares(limits: JointLimits, q: np.ndarray) -> np.ndarray:
+    """Peaks of speed, acceleration and jerk of positions at 1 kHz, over their limits."""
     assert (q >= limits.lower - 1e-9).all() and (q <= limits.upper + 1e-9).all()
-    velocity, acceleration, jerk = (np.diff(q, k, axis=0) * 1e3**k for k in (1, 2, 3))
+    velocity, acceleration, jerk = (np.diff(q, k, axis=0) / DT**k for k in (1, 2, 3))
     low, high = limits.speed_range(q[1:])
     ceiling = np.maximum(np.where(velocity > 0, high, -low), 1e-9)
-    return np.array(
-        [
-            (np.abs(velocity) / ceiling).max(),
-            (np.abs(acceleration) / limits.acceleration).max(),
-            (np.abs(jerk) / limits.jerk).max(),
-        ]
-    )
+    shares = velocity / ceiling, acceleration / limits.acceleration, jerk / limits.jerk
+    return np.array([np.abs(share).max() for share in shares])
 
 
-@pytest.mark.parametrize(("robot", "arm"), ROBOTS, ids=["FR3", "UR5e"])
+def at_1_khz(move: Trajectory) -> np.ndarray:
+    """With rest before and after."""
+    return move.at(np.arange(-5, int(move.duration / DT) + 6) * DT)
+
+
+@BOTH
 def test_full_speed_joint_moves_use_a_limit_up_and_exceed_none(
     robot: RobotLimits, arm: Kinematics
 ) -> None:
@@ -54,14 +56,14 @@ def test_full_speed_joint_moves_use_a_limit_up_and_exceed_none(
     for _ in range(40):
         goal = rng.uniform(limits.lower, limits.upper)
         move = joint_move(q, goal, limits)
-        shares = peak_shares(move, limits)
+        shares = peak_shares(limits, at_1_khz(move))
         assert (shares <= 1).all() and shares.max() > 0.97
         np.testing.assert_allclose(move.at(0.0), q, atol=1e-12)
         np.testing.assert_allclose(move.at(move.duration), goal, atol=1e-12)
         q = goal
 
 
-@pytest.mark.parametrize(("robot", "arm"), ROBOTS, ids=["FR3", "UR5e"])
+@BOTH
 def test_retreats_are_straight_and_within_limits(robot: RobotLimits, arm: Kinematics) -> None:
     limits, rng = robot.policy, np.random.default_rng(1)
     for _ in range(6):
@@ -69,7 +71,7 @@ def test_retreats_are_straight_and_within_limits(robot: RobotLimits, arm: Kinema
         q = arm.solve_ik(low, fingers_down(rng.uniform(-1, 1)), arm.arm.home)
         high, rotation = low + np.array([0.05, -0.05, 0.2]), fingers_down(rng.uniform(-1, 1))
         move = straight_line(arm, q, high, rotation, limits)
-        assert (peak_shares(move, limits) <= 1).all()
+        assert (peak_shares(limits, at_1_khz(move)) <= 1).all()
         poses = [arm.forward(p) for p in move.sample(50)]
         along = (high - low) / np.linalg.norm(high - low)
         points = np.array([p for p, _ in poses])
@@ -87,17 +89,12 @@ def test_a_move_to_the_same_place_stays() -> None:
 def test_what_cannot_be_done_is_refused_in_a_line() -> None:
     robot, arm = ROBOTS[0]
     home, limits = robot.arm.home, robot.policy
-    with pytest.raises(UserError, match="joint 2"):
-        joint_move(home, home + 3 * np.eye(7)[1], limits)
     with pytest.raises(UserError, match="cannot follow"):
         straight_line(arm, home, np.array([1.5, 0, 0.3]), fingers_down(0), limits)
     with pytest.raises(UserError, match="workspace box"):
         require_inside_workspace(
             joint_move(home, home + 1.5 * np.eye(7)[0], limits), ActionFilter(robot, 20)
         )
-
-
-DT = 1e-3
 
 
 def track(robot: RobotLimits, targets: list[tuple[np.ndarray, int]], hz: int = 20) -> np.ndarray:
@@ -113,11 +110,7 @@ def track(robot: RobotLimits, targets: list[tuple[np.ndarray, int]], hz: int = 2
 
 
 def check_within(limits: JointLimits, q: np.ndarray) -> None:
-    velocity, acceleration, jerk = (np.diff(q, k, axis=0) / DT**k for k in (1, 2, 3))
-    assert (np.abs(velocity) <= limits.velocity + 1e-9).all()
-    assert (np.abs(acceleration) <= limits.acceleration + 1e-6).all()
-    assert (np.abs(jerk) <= limits.jerk + 1e-3).all()
-    assert (q >= limits.lower - 1e-12).all() and (q <= limits.upper + 1e-12).all()
+    assert (peak_shares(limits, q) <= 1 + 1e-6).all()
 
 
 HURRIED = st.lists(

@@ -19,8 +19,6 @@ from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
 from touchgoal.runtime.errors import UserError
 
-BITS = 12
-
 
 def plug(root: Path, node: int, product: str, serial: str, index: int = 0) -> None:
     """Nodes as Linux makes them: class/videoN/device links to an interface of a USB device."""
@@ -108,9 +106,8 @@ def test_exposure_and_white_balance_are_locked_or_refused(monkeypatch: pytest.Mo
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: plugged)
     VideoCamera(VideoConfig("0", exposure=120.0, white_balance=4600)).close()
     assert plugged.set_to[cv2.CAP_PROP_AUTO_EXPOSURE] == 1  # V4L2_EXPOSURE_MANUAL
-    assert (
-        plugged.set_to[cv2.CAP_PROP_EXPOSURE] == 120 and plugged.set_to[cv2.CAP_PROP_AUTO_WB] == 0
-    )
+    assert plugged.set_to[cv2.CAP_PROP_EXPOSURE] == 120
+    assert plugged.set_to[cv2.CAP_PROP_AUTO_WB] == 0
     assert plugged.set_to[cv2.CAP_PROP_WB_TEMPERATURE] == 4600
     plugged.keeps = 99.0
     with pytest.raises(UserError, match="keeps exposure 99 instead of 120"):

@@ -19,12 +19,13 @@ class Blocker(MetaPathFinder):
 sys.meta_path.insert(0, Blocker())
 
 import numpy as np
-from fake_cell import FakeArm, FakeClock, FakeGripper
+from fake_cell import FakeCell, write_cell_file
 
 from touchgoal.control.cell.cell_file import read_cell_file
-from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.actors import load_user_policy, make_actor
+from touchgoal.control.deployment.control_loop import ControlLoop
 from touchgoal.control.deployment.session import Result, Session
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.launch import deploy
@@ -59,12 +60,9 @@ class Ends(Turns):
 
 
 def run(folder: Path, policy: str, seconds: float) -> tuple[Result, dict]:
-    file = folder / "cell.toml"
-    file.write_text(CELL.replace("POLICY", policy).replace("40.0", str(seconds)))
-    cell, clock, recorded = read_cell_file(file), FakeClock(), {}
-    connection = CellConnection(
-        FR3, FakeArm(clock), FakeGripper(clock, follows=True), {}, None, clock
-    )
+    text = CELL.replace("POLICY", policy).replace("40.0", str(seconds))
+    cell, fake, recorded = read_cell_file(write_cell_file(folder, text)), FakeCell(), {}
+    fake.gripper.follows = True
     safety = ActionFilter(FR3, 20)
     loaded = load_user_policy(cell, env_config_of(cell))
 
@@ -72,16 +70,11 @@ def run(folder: Path, policy: str, seconds: float) -> tuple[Result, dict]:
         recorded.update(frames)
         return 0
 
-    session = Session(
-        cell=cell,
-        connection=connection,
-        safety=safety,
-        record=record,
-        execute=True,
-        make_actor=lambda loop: make_actor(cell, loaded, safety, None, loop.commanded),
-        operator_request=lambda: "",
-        on_tick=lambda _: None,
-    )
+    def actor(loop: ControlLoop) -> Actor:
+        return make_actor(cell, loaded, safety, None, loop.commanded)
+
+    nobody = lambda: "", lambda _: None  # asks, or is told
+    session = Session(cell, fake.connection(), safety, record, True, actor, *nobody)
     return session.run(), recorded
 
 

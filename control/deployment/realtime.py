@@ -78,7 +78,6 @@ class RealTimeActor(Actor):
         self._planner, self._config = planner, planner.config
         # s from an observation to its plan, without the first plan
         self.latencies: list[float] = []
-        self.ticks_without_plan = 0
         self._lag = lag
         self._before: np.ndarray | None = None  # joints (rad) wanted at the last tick
         self.failure: BaseException | None = None  # ended the planning thread; `act` raises it
@@ -157,7 +156,6 @@ class RealTimeActor(Actor):
             self._width = float(action[ft.N_JOINTS])
             self.action_age = 0.0
             return action
-        self.ticks_without_plan += 1
         self.action_age += 1 / self._config.control_hz
         return np.append(np.zeros(ft.N_JOINTS), self._width).astype(np.float32)
 
