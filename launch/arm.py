@@ -1,6 +1,6 @@
 """Move an arm or its hand without a task, or recover the arm after a reflex or a stop.
 
-`home` moves slowly to the cell file's task.start, by default to the arm's home; `open` lets go of what the
+With `home` it moves slowly to the cell file's task.start, by default to the arm's home; `open` lets go of what the
 hand holds. Speed, workspace, force and torque are limited as in `deploy`; cameras and fingertips are
 not read, so gels are not watched. Exit status: 0 done, 1 nothing moved, 4 the arm was stopped.
 """

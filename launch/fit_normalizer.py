@@ -26,14 +26,14 @@ class Config:
     """Modalities to fit: image and tactile by default, as far as the episodes have them; name text, too,
     for goals that are sentences."""
     value: bool = False
-    """Also fit a value of the task, from 4 successes on, in a minute or two. It holds for this task,
-    these cameras and towers, and does not read the goal."""
+    """Also fit a value of the task: a network that reads progress from images, whatever the goal. It
+    needs at least 4 successes and a minute or two, and holds for these cameras and towers."""
     success_from: CountOrNone = 0
     """Number of successes, the last ones, that fit nothing else and set the threshold of success
     (success.json): at least 9, for at most 10 % of successes rejected. 0: no threshold."""
     made_failures: CountOrNone = 0
-    """Number of these successes from whose images seven kinds of failure are made, to see how many
-    pass the threshold."""
+    """Make seven kinds of failure from the images of so many of the successes of --success-from, to
+    see how many failures pass the threshold."""
     camera: str = "front"
     """Camera of the plain distance of images, such as front, wrist or a LeRobot set's top."""
     keys: Annotated[tuple[str, ...], RARE] = ()
@@ -48,7 +48,7 @@ class Config:
     assume_success: bool = False
     """Take episodes without a recorded outcome as successes."""
     seed: Seed = 0
-    """Random seed of the value."""
+    """Random seed of the training of the value."""
     device: str = "cpu"
     """Torch device of the encoders: cpu, cuda or cuda:1."""
     out: Path | None = None

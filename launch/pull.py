@@ -1,6 +1,6 @@
 """Download an encoder or a policy that `push` uploaded to the Hugging Face Hub, and check it.
 
-`--encoder owner/name` and `--policy owner/name` then find it, in the same working directory.
+Afterwards `--encoder owner/name` or `--policy owner/name` finds it, in the same working directory.
 """
 
 from pathlib import Path

@@ -97,6 +97,18 @@ def test_arguments_and_the_folder_have_names_and_defaults(capsys: pytest.Capture
         assert usage in (printed := capsys.readouterr().out)
         if name != "completion":
             assert "runs/<date>_<command>" in printed
+    with pytest.raises(SystemExit):
+        main(["pull", "--help"])
+    assert "runs/<date>_<command>" not in capsys.readouterr().out  # it says its own default
+
+
+def test_paragraphs_of_help_are_joined(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit):
+        main(["fit-normalizer", "--help"])
+    printed = capsys.readouterr().out
+    assert "With --value it also" in " ".join(printed.split())
+    assert not any(line.startswith("--value") for line in printed.splitlines())
+    assert "1 more option, rarely needed" in printed and "(default: )" not in printed
 
 
 def test_a_mistyped_option_or_command_is_guessed(capsys: pytest.CaptureFixture) -> None:

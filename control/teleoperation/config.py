@@ -12,7 +12,7 @@ class TeleoperationConfig:
     """Response of the hand to a device."""
 
     speed: Annotated[float, Field(gt=0, le=0.5)] = 0.1
-    """Speed of the hand at full deflection, m/s; a keyboard knows no other."""
+    """Speed of the hand at full deflection, m/s; with a keyboard, at any key."""
     turn_speed: Annotated[float, Field(gt=0, le=2)] = 0.6
     """Turning speed of the hand at full deflection, rad/s."""
     compliance: Annotated[NotNegative, Field(le=0.01)] = 2e-3

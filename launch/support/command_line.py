@@ -40,6 +40,7 @@ def parse(
     argument was not understood (2).
     """
     _refuse_empty_values(arguments)
+    description = re.sub(r"(?<=\S)\n(?=\S)", " ", description)  # tyro does so before letters alone
     short = not {"--help", "-h"}.isdisjoint(arguments)  # tyro does not accept what it hides
     typed = ["--help" if a == "--help-all" else a for a in arguments]
     env = envs[_task(typed, envs)] if envs else None
@@ -58,7 +59,9 @@ def parse(
         name = next((a for a in typed if a in hidden_of), "")
         if stop.code == 0 and hidden & hidden_of.get(name, set()):
             command = f"{prog} {name}".strip()
-            print(f"{len(hidden_of[name])} more options, rarely needed: {command} --help-all")
+            more = len(hidden_of[name])
+            what = f"{more} more option{'s' * (more > 1)}, rarely needed"
+            print(f"{what}: {command} --help-all")
         if stop.code == 2 and env is not None and envs is not None:
             _point_to_other_task(typed, env, envs)
         raise
@@ -90,8 +93,13 @@ def _as_options(
         kinds = [get_origin(kind) for kind in (_bare(annotation), *get_args(_bare(annotation)))]
         if tyro.conf.Positional in getattr(annotation, "__metadata__", ()) and Literal not in kinds:
             offered = Annotated[offered, tyro.conf.arg(metavar=field.name.upper())]
-        if default is None or default == ():  # the help text says what an empty default means
-            hint = "(default: runs/<date>_<command>)" if field.name == "out" else ""
+        hint = None
+        if default is None or default in ((), ""):  # the help text says what it then is
+            is_run = field.name == "out" and "default" not in text
+            hint = "(default: runs/<date>_<command>)" if is_run else ""
+        elif default is tyro.MISSING:
+            hint = "(required)"
+        if hint is not None:
             offered = Annotated[offered, tyro.conf.arg(help_behavior_hint=hint)]
         fields.append(StructFieldSpec(field.name, offered, default, text))
     return StructConstructorSpec(partial(_make, info.type), tuple(fields))
