@@ -27,7 +27,7 @@ from touchgoal.encoders.training.trainer import (
 )
 from touchgoal.launch import train_encoder
 from touchgoal.policies.config import TrainConfig
-from touchgoal.policies.heads.diffusion import RegressionConfig
+from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.training.train import train
 from touchgoal.runtime.errors import UserError
 
@@ -149,7 +149,7 @@ def trainings() -> dict[str, Callable[[Path], object]]:
         "align": lambda out: test_align.run_align(*touches, towers, align, out, {}),
         "diffusion": partial(policy, toy_policies.DIFFUSION),
         "flow": partial(policy, toy_policies.FLOW),
-        "regression": partial(policy, RegressionConfig(width=16)),
+        "regression": partial(policy, MLPConfig(width=16)),
         "contact": lambda out: test_estimators.train_contact(256, 2, out),
         "pose": lambda out: test_estimators.train_pose(64, 2, out),
     }

@@ -80,10 +80,9 @@ def run(config: Config) -> dict[str, Any]:
 
 def _inputs(env: TaskConfig) -> dict[str, tuple[str, ...]]:
     """Return the inputs that a policy may read in an environment: name -> columns."""
-    cameras = {name: (ft.IMAGE_PREFIX + name,) for name in env.cameras}
-    touch = {"touch": tuple(ft.TACTILE)} if env.tactile else {}
-    state = {"arm's state": (ft.STATE, ft.TCP_POSE, ft.COMMAND), "wrench": (ft.WRENCH,)}
-    return touch | cameras | state
+    inputs: dict[str, tuple[str, ...]] = {"touch": ft.TACTILE} if env.tactile else {}
+    inputs |= {name: (ft.IMAGE_PREFIX + name,) for name in env.cameras}
+    return inputs | {"arm's state": (ft.STATE, ft.TCP_POSE, ft.COMMAND), "wrench": (ft.WRENCH,)}
 
 
 def _audit(
