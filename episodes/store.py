@@ -24,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Shaped, UInt8
 
-from touchgoal.episodes.format import episode_table, set_files
+from touchgoal.episodes.format import episode_table, remote, set_files
 from touchgoal.episodes.format.encoding import EncodedEpisode, data_file, encode, read_columns
 from touchgoal.episodes.format.episode_table import EpisodePlace
 from touchgoal.episodes.format.foreign import foreign_file, refusal
@@ -60,9 +60,10 @@ class EpisodeWriter:
 
         Raises:
             UserError: An existing set has another rate, was interrupted, is damaged or was edited by
-                lerobot; another process records into it; the folder cannot be made.
+                lerobot; another process records into it; the folder cannot be made or is remote.
         """
         self._root = Path(root)
+        remote.check_local(self._root)
         self._fps = fps
         self._lock = FolderLock(self._root)
         try:
@@ -137,7 +138,7 @@ class EpisodeWriter:
         for key, video in encoded.videos.items():
             write_file(self._root / set_files.video_path(key, file_number), video)
         write_file(path, data_file(encoded, current.index_columns_for(description)))
-        updated.write(self._root)
+        updated.write(self._root, first_file=len(updated.files) - 1)
         self._metadata = updated
         return len(self) - 1
 
@@ -154,7 +155,8 @@ class EpisodeSet:
         """Open a set.
 
         Args:
-            root: Folder of the set, or of the run that recorded it into its `episodes/`.
+            root: Folder of the set, or of the run that recorded it into its `episodes/`; or its address,
+                such as s3://bucket/set (see `remote`). Attribute `root` is then the mirror.
             complete: Whether every file must be there; else `read` finds what is missing.
             keys: New keys of features by their stored names; None for those of the command
                 (`--keys`). In a set that touchgoal did not write, tactile images under other names
@@ -164,7 +166,7 @@ class EpisodeSet:
             UserError: Not a set, or of an unknown version; a metadata file is corrupt; a file is
                 missing; a key that cannot be.
         """
-        self.root = set_files.set_folder(Path(root))
+        self.root = set_files.set_folder(remote.local_folder(Path(root)))
         info = set_files.load_info(self.root)
         self.fps: int = info["fps"]
         table = episode_table.load_table(self.root, leave_out="stats/")
@@ -182,7 +184,7 @@ class EpisodeSet:
         self._places = episode_table.locate_episodes(self.root, info, table)
         files = {name for place in self._places for name in place.files} if complete else ()
         for name in files:  # before any work with the others
-            if not (self.root / name).is_file():
+            if not remote.has_file(self.root, name):
                 raise self._unreadable(name, FileNotFoundError())
 
     def __len__(self) -> int:
@@ -204,7 +206,7 @@ class EpisodeSet:
     @cached_property
     def _table(self) -> pa.Table:
         """meta/episodes with statistics."""
-        return set_files.load_table(self.root, set_files.EPISODES).slice(0, len(self))
+        return episode_table.load_table(self.root).slice(0, len(self))
 
     @property
     def lengths(self) -> list[int]:
@@ -269,20 +271,15 @@ class EpisodeSet:
         """
         place = self._place(i).videos[self._stored[key]]
         with self._readable(place.file):
-            length, fps = video_length(self.root / place.file)
+            length, fps = video_length(self._file(place.file))
         return place.n_frames, length - place.first_frame, fps
 
     def read(
         self, i: int, keys: Sequence[str] | None = None, frames: Sequence[int] | None = None
     ) -> Episode:
-        """Read episode i; only the keys and frames asked for are decoded.
+        """Read episode i; only the keys and frames asked for, in any order, are decoded.
 
-        Args:
-            keys: Keys to read; None for all.
-            frames: Indices of the frames to read, in any order; None for all.
-
-        Raises:
-            UserError: No such episode, key or frame; a file is missing or corrupt.
+        UserError: no such episode, key or frame; a file is missing or corrupt.
         """
         place = self._place(i)
         keys = list(self.features) if keys is None else keys
@@ -309,6 +306,10 @@ class EpisodeSet:
             raise UserError(f"{self.root} has episodes 0 to {len(self) - 1}, not {i}")
         return self._places[i]
 
+    def _file(self, name: str) -> Path:
+        """Return a file of the set, fetched if the set is remote."""
+        return remote.fetched(self.root, name)
+
     def _unreadable(self, name: str, error: Exception) -> UserError:
         """Return the error that a file is missing or broken; only own sets can be repaired."""
         if not self.foreign:
@@ -333,7 +334,7 @@ class EpisodeSet:
         place = self._place(i)
         with (
             self._readable(place.data_file),
-            pq.ParquetFile(self.root / place.data_file, page_checksum_verification=True) as file,
+            pq.ParquetFile(self._file(place.data_file), page_checksum_verification=True) as file,
         ):
             rows = file.metadata.num_rows
             if place.alone and rows != place.length:
@@ -344,8 +345,9 @@ class EpisodeSet:
 
     def _stored_column(self, place: EpisodePlace, name: str, keep: bool = True) -> pa.Array:
         """Return a column of one episode; small ones are kept for the file's other episodes."""
-        path, read = self.root / place.data_file, _read_column if keep else _read_column.__wrapped__
+        read = _read_column if keep else _read_column.__wrapped__
         with self._readable(place.data_file):
+            path = self._file(place.data_file)
             column = read(path, path.stat().st_mtime_ns, name)
             return pa.concat_arrays(column.slice(place.first_row, place.length).chunks)
 
@@ -358,7 +360,7 @@ class EpisodeSet:
                 video = place.videos[stored]
                 with self._readable(video.file):
                     found[stored] = video_checksum(
-                        self.root / video.file, self.fps, video.first_frame, place.length
+                        self._file(video.file), self.fps, video.first_frame, place.length
                     )
             elif feature["dtype"] == "image":
                 images = self._stored_column(place, stored, keep=False).field("bytes")
@@ -372,7 +374,7 @@ class EpisodeSet:
         self, place: EpisodePlace, stored: str, frames: np.ndarray
     ) -> UInt8[np.ndarray, "n h w 3"]:
         video = place.videos[stored]
-        source: bytes | Path = self.root / video.file
+        source: bytes | Path = self._file(video.file)
         if not self.foreign and video.crc32 is not None:
             source = set_files.read_video(self.root, video.file, video.crc32)
         with self._readable(video.file):
@@ -390,7 +392,7 @@ def load_episodes(
 ) -> EpisodeSet:
     """Open a set of episodes that touchgoal or lerobot wrote; see `EpisodeSet`.
 
-    episodes = touchgoal.load_episodes("my_set", {"observation.images.top": "observation.images.front"})
-    episodes.read(0).frames["observation.images.front"]  # (T, height, width, 3)
+    episodes = touchgoal.load_episodes("s3://bucket/set", {"observation.images.top": ft.FRONT})
+    episodes.read(0).frames[ft.FRONT]  # (T, height, width, 3)
     """
     return EpisodeSet(path, keys=keys)

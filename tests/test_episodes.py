@@ -333,3 +333,23 @@ def test_unreadable_media(tmp_path: Path) -> None:
             read_frames(tmp_path / name)
     with pytest.raises(UserError, match="even height"):
         write_video(tmp_path / "odd.mp4", np.zeros((2, 7, 8, 3), np.uint8), 20)
+
+
+def test_an_append_rewrites_the_last_file_of_the_episodes_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(set_files, "CHUNK", 2)
+    record(tmp_path, range(3))
+    first = (tmp_path / set_files.EPISODES).stat().st_mtime_ns
+    record(tmp_path, range(3, 5))
+    assert_holds(tmp_path, [0, 1, 2, 3, 4])
+    assert (tmp_path / set_files.EPISODES).stat().st_mtime_ns == first
+    rows = pq.read_table(tmp_path / "meta/episodes").to_pylist()
+    assert [row["meta/episodes/file_index"] for row in rows] == [0, 0, 1, 1, 0]
+    assert [row["meta/episodes/chunk_index"] for row in rows] == [0, 0, 0, 0, 1]
+    assert validate(tmp_path) == [] and not EpisodeSet(tmp_path).foreign
+    (tmp_path / set_files.episodes_path(1)).unlink()
+    with pytest.raises(UserError, match="it lists 3 of 5 episodes"):
+        EpisodeSet(tmp_path)
+    assert repair(tmp_path) and validate(tmp_path) == []
+    assert_holds(tmp_path, [0, 1, 2, 3, 4])

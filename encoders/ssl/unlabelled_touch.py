@@ -12,6 +12,7 @@ from touchgoal.encoders.ssl.frames import (
     sample_frames,
     sample_recordings,
 )
+from touchgoal.episodes.format.remote import local_folder
 from touchgoal.episodes.importers.labelled_videos import has_labels, read_labelled_videos
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
 from touchgoal.episodes.overlap import require_disjoint, require_no_shared_frames
@@ -119,6 +120,7 @@ def _require_no_overlap(train: Sequence[_Source], other: Sequence[_Source]) -> N
 
 
 def _open(folder: Path, sensor: str | None) -> _Source:
+    folder = local_folder(folder)
     if (folder / "meta").exists():
         episodes = EpisodeSet(folder)
         return _Source(folder, find_sensor_name(sensor, episodes), episodes)

@@ -159,7 +159,7 @@ def write_table(table: pa.Table, description: Description) -> bytes:
 
 
 def has_description(file: pq.ParquetFile) -> bool:
-    """Return whether touchgoal wrote a data file."""
+    """Return whether touchgoal wrote a Parquet file."""
     return _FOOTER_KEY in (file.schema_arrow.metadata or {})
 
 

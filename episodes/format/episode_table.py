@@ -43,8 +43,7 @@ def load_table(root: Path, leave_out: str | None = None) -> pa.Table:
 
     UserError: a file is missing or broken, or their columns are not of one type.
     """
-    paths = sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet"))
-    names = [path.relative_to(root).as_posix() for path in paths] or [set_files.EPISODES]
+    names = set_files.episodes_files(root)
     tables = [set_files.load_table(root, name, leave_out) for name in names]
     try:
         return pa.concat_tables(tables, promote_options="permissive").combine_chunks()

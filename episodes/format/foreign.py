@@ -1,7 +1,7 @@
 """Detection of sets that lerobot wrote, edited or continued.
 
-touchgoal writes one file under meta/episodes, and one data file an episode with a description in its
-footer; lerobot puts several episodes into a file, begins further files and drops the footers.
+touchgoal writes one data file an episode with a description in its footer, and marks the footers under
+meta/episodes; lerobot puts several episodes into a file, begins further files and drops the footers.
 """
 
 from contextlib import suppress
@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 from touchgoal.control.features import FEATURES
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import has_description
+from touchgoal.episodes.format.remote import fetched
 from touchgoal.episodes.schema import INDEX_DTYPES
 from touchgoal.runtime.errors import UserError
 
@@ -24,9 +25,10 @@ def foreign_file(root: Path, features: dict[str, Any], episodes: pa.Table | None
     `episodes` is None if meta/episodes cannot be read. UserError: the set is touchgoal's own, and a
     file under meta/ is corrupt.
     """
-    listed = (root / "meta/episodes").rglob("*.parquet")
-    if others := sorted(path for path in listed if path != root / set_files.EPISODES):
-        return others[0]
+    listed = sorted((root / "meta/episodes").rglob("*.parquet"))
+    others = (path for path in listed if path != root / set_files.EPISODES)
+    if other := next((path for path in others if _written_by_touchgoal(path) is False), None):
+        return other
     if unknown := sorted(set(features) - {*FEATURES, *INDEX_DTYPES}):
         error = ValueError(f"unknown feature {unknown[0]!r}")
         return _foreign_unless_own(root, set_files.INFO, error)
@@ -38,7 +40,7 @@ def foreign_file(root: Path, features: dict[str, Any], episodes: pa.Table | None
     if unchecked or len({set_files.data_path_of(row) for row in places}) < len(places):
         error = ValueError("wrong places of files")
         return _foreign_unless_own(root, set_files.EPISODES, error)
-    last = root / set_files.data_path_of(places[-1])
+    last = fetched(root, set_files.data_path_of(places[-1]))
     return last if _written_by_touchgoal(last) is False else None
 
 
@@ -64,7 +66,7 @@ def foreign_data_file(root: Path, if_none: Path | None = None) -> Path | None:
 
 
 def _written_by_touchgoal(path: Path) -> bool | None:
-    """Return whether a data file has a description in its footer; None if it cannot be read."""
+    """Return whether a Parquet file has touchgoal's footer; None if it cannot be read."""
     with suppress(OSError, pa.ArrowException), pq.ParquetFile(path) as file:
         return has_description(file)
     return None

@@ -1,7 +1,9 @@
 """The files under meta/ of a LeRobotDataset v3.
 
 Columns of meta/episodes beyond LeRobot's, which ignores them: `touchgoal/NAME` for the entry NAME of an
-episode's `meta` (scalar or list of strings), `videos/KEY/crc32` for the checksum of its video.
+episode's `meta` (scalar or list of strings), `videos/KEY/crc32` for the checksum of its video. An append
+rewrites the last file of meta/episodes alone, which holds at most `CHUNK` rows: it costs the same in a set of any
+size.
 """
 
 import io
@@ -22,6 +24,8 @@ from touchgoal.episodes.format.statistics import Stats, array_statistics, merge
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
+_OWN = {b"touchgoal": b"episodes"}  # footer by which a file is recognised, see `foreign`
+
 
 @dataclass(frozen=True)
 class SetMetadata:
@@ -31,18 +35,28 @@ class SetMetadata:
     features: dict[str, dict[str, Any]]  # as in info.json
     tasks: tuple[str, ...] = ()  # all instructions; the position is the task_index
     stats: dict[str, Stats] | None = None  # statistics over all frames by key
-    episodes: pa.Table | None = None  # meta/episodes, a row per episode; None before the first
+    files: tuple[pa.Table, ...] = ()  # meta/episodes, a row per episode, at most CHUNK per file
 
     @property
     def n_episodes(self) -> int:
         """Number of episodes."""
-        return 0 if self.episodes is None else self.episodes.num_rows
+        return sum(table.num_rows for table in self.files)
+
+    @property
+    def _last(self) -> Row:
+        """Row of the last episode without statistics; {} before the first."""
+        return set_files.last_row(self.files[-1]) if self.files else {}
+
+    @property
+    def _next_file(self) -> int:
+        """Number of the file of meta/episodes that takes the next row."""
+        full = not self.files or self.files[-1].num_rows >= set_files.CHUNK
+        return len(self.files) - (not full)
 
     @property
     def next_file_number(self) -> int:
         """Number of the next episode's files."""
-        last = set_files.last_row(self.episodes)
-        return set_files.file_number_of(last) + 1 if last else 0
+        return set_files.file_number_of(self._last) + 1 if self.files else 0
 
     def with_episode(self, description: Description, file_number: int) -> "SetMetadata":
         """Return this metadata with one more episode, whose files have number `file_number`.
@@ -56,22 +70,21 @@ class SetMetadata:
             for key, column in self.index_columns_for(description).items()
         }
         row = self._row(description, file_number, stats)
-        schema = _schema(row) if self.episodes is None else self.episodes.schema
+        schema = self.files[-1].schema if self.files else _schema(row)
         if differing := _differing_meta(row, schema):
             raise UserError(
                 f"the episode's meta differs from the set's in {', '.join(differing)}: give every "
                 "episode of a set the same keys with the same types"
             )
-        table = pa.Table.from_pylist([row], schema=schema)
-        if self.episodes is not None:
-            table = pa.concat_tables([self.episodes, table]).combine_chunks()
+        full, begun = self.files[: self._next_file], self.files[self._next_file :]
+        table = pa.concat_tables([*begun, pa.Table.from_pylist([row], schema=schema)])
         if self.stats is not None:
             stats = {key: merge(self.stats[key], stats[key]) for key in stats}
-        return replace(self, tasks=tasks, stats=stats, episodes=table)
+        return replace(self, tasks=tasks, stats=stats, files=(*full, table.combine_chunks()))
 
     def index_columns_for(self, description: Description) -> dict[str, Any]:
         """Return the index columns of an episode that would come next."""
-        before = set_files.last_row(self.episodes)
+        before = self._last
         tasks = list(dict.fromkeys((*self.tasks, description.task)))
         return index_columns(
             description.length,
@@ -117,25 +130,26 @@ class SetMetadata:
                     "options that the set was recorded with, or record into another folder"
                 )
         name = set_files.META_PREFIX + "task"
-        if self.episodes is not None and name in self.episodes.column_names:
-            if others := {*self.episodes[name].to_pylist()} - {task}:
+        if self.files and name in self.files[0].column_names:
+            if others := {t for table in self.files for t in table[name].to_pylist()} - {task}:
                 raise UserError(
                     f"{root} holds {min(others)}, not {task}: record into another folder"
                 )
 
     def _row(self, description: Description, file_number: int, stats: dict[str, Stats]) -> Row:
-        before = set_files.last_row(self.episodes)
+        before = self._last
         first = before["dataset_to_index"] if before else 0
         chunk, file = divmod(file_number, set_files.CHUNK)
         place = {"chunk_index": chunk, "file_index": file}
+        listed_in = divmod(self._next_file, set_files.CHUNK)
         row: Row = {
             "episode_index": before["episode_index"] + 1 if before else 0,
             "tasks": [description.task],
             "length": description.length,
             "dataset_from_index": first,
             "dataset_to_index": first + description.length,
-            "meta/episodes/chunk_index": 0,
-            "meta/episodes/file_index": 0,
+            "meta/episodes/chunk_index": listed_in[0],
+            "meta/episodes/file_index": listed_in[1],
         }
         row |= {f"data/{name}": value for name, value in place.items()}
         for key, crc32 in description.video_crc32.items():
@@ -147,16 +161,21 @@ class SetMetadata:
             row |= {f"stats/{key}/{name}": value for name, value in values.items()}
         return row
 
-    def write(self, root: Path) -> None:
-        """Write all of meta/, each file atomically; info.json comes last and commits the change."""
-        write_file(root / set_files.EPISODES, _parquet(self.episodes))
+    def write(self, root: Path, first_file: int = 0) -> None:
+        """Write meta/, each file atomically; info.json comes last and commits the change.
+
+        Files of meta/episodes before `first_file` are left as they are.
+        """
+        for number, table in list(enumerate(self.files))[first_file:]:
+            marked = table.replace_schema_metadata(_OWN)
+            write_file(root / set_files.episodes_path(number), _parquet(marked))
         write_file(root / set_files.STATS, _json(self.stats))
         write_file(root / set_files.TASKS, _parquet(_tasks_table(self.tasks)))
         write_file(root / set_files.INFO, _json(self.info()))
 
     def info(self) -> dict[str, Any]:
         """Return the content of info.json."""
-        last = set_files.last_row(self.episodes)
+        last = self._last
         videos = any(feature["dtype"] == "video" for feature in self.features.values())
         return {
             "codebase_version": set_files.VERSION,
@@ -178,19 +197,22 @@ class SetMetadata:
     def load(cls, root: Path) -> "SetMetadata":
         """Read all of meta/.
 
-        UserError: no set, an unknown version, or a file that cannot be read.
+        UserError: no set, an unknown version, or a file that is missing or cannot be read.
         """
-        info = set_files.load_info(root)
+        info, names = set_files.load_info(root), set_files.episodes_files(root)
+        for name in map(set_files.episodes_path, range(len(names))):
+            if name not in names:
+                raise set_files.unreadable(root, name, FileNotFoundError())
         return cls(
             fps=info["fps"],
             features=info["features"],
             tasks=tuple(set_files.load_table(root, set_files.TASKS)["task"].to_pylist()),
             stats=set_files.load_json(root, set_files.STATS),
-            episodes=set_files.load_table(root, set_files.EPISODES),
+            files=tuple(set_files.load_table(root, name) for name in names),
         )
 
 
-def _parquet(table: pa.Table | None) -> bytes:
+def _parquet(table: pa.Table) -> bytes:
     file = io.BytesIO()
     pq.write_table(table, file, write_page_checksum=True)
     return file.getvalue()

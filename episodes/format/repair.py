@@ -2,6 +2,7 @@
 
 import itertools
 import os
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,15 @@ from touchgoal.runtime.progress import track
 REPAIRED = "repaired"
 _FOLDERS = ("data", "videos", "meta")
 _META = (set_files.INFO, set_files.EPISODES, set_files.TASKS, set_files.STATS)
+_ROWS = 100  # compared at a time
 _DATA_FILES = "chunk-[0-9][0-9][0-9]/file-[0-9][0-9][0-9].parquet"
 
 
 def unlisted_files(root: Path, set_metadata: SetMetadata | None) -> list[str]:
     """Return the files that belong to no listed episode, as paths in the set, without hidden ones."""
     known = set(_META)
+    if set_metadata:
+        known |= {set_files.episodes_path(number) for number in range(len(set_metadata.files))}
     cameras = _cameras(set_metadata.features) if set_metadata else []
     for file_number in _file_numbers(set_metadata):
         known |= {set_files.data_path(file_number)} | {
@@ -40,12 +44,9 @@ def unlisted_files(root: Path, set_metadata: SetMetadata | None) -> list[str]:
 
 
 def _file_numbers(set_metadata: SetMetadata | None) -> list[int]:
-    if set_metadata is None or set_metadata.episodes is None:
-        return []
     names = ["data/chunk_index", "data/file_index"]
-    return [
-        set_files.file_number_of(row) for row in set_metadata.episodes.select(names).to_pylist()
-    ]
+    tables = set_metadata.files if set_metadata else ()
+    return [set_files.file_number_of(row) for t in tables for row in t.select(names).to_pylist()]
 
 
 def _cameras(features: dict[str, dict[str, Any]]) -> list[str]:
@@ -119,10 +120,9 @@ def validate(root: str | os.PathLike[str]) -> list[str]:
 
 def _altered_meta(root: Path, found: SetMetadata, rebuilt: SetMetadata) -> list[str]:
     """Return the files under meta/ whose content is not that of the data files."""
-    assert found.episodes is not None and rebuilt.episodes is not None
     same = {
         set_files.INFO: set_files.load_info(root) == rebuilt.info(),
-        set_files.EPISODES: found.episodes.to_pylist() == rebuilt.episodes.to_pylist(),
+        set_files.EPISODES: all(a == b for a, b in zip(_rows(found), _rows(rebuilt), strict=True)),
         set_files.TASKS: found.tasks == rebuilt.tasks,
         set_files.STATS: found.stats == rebuilt.stats,
     }
@@ -131,6 +131,14 @@ def _altered_meta(root: Path, found: SetMetadata, rebuilt: SetMetadata) -> list[
         for name, equal in same.items()
         if not equal
     ]
+
+
+def _rows(set_metadata: SetMetadata) -> Iterator[set_files.Row]:
+    """Yield the rows of meta/episodes, in whichever of its files they are."""
+    for table in set_metadata.files:
+        names = [name for name in table.column_names if not name.startswith("meta/episodes/")]
+        for batch in table.select(names).to_batches(max_chunksize=_ROWS):
+            yield from batch.to_pylist()
 
 
 def repair(root: str | os.PathLike[str]) -> list[str]:
@@ -168,7 +176,8 @@ def _repair(root: Path) -> list[str]:
             _rewrite_index_columns(path, description, table, before.index_columns_for(description))
             done.append(f"renumbered {path}")
     done += [_move_to_repaired(root, name) for name in unlisted_files(root, set_metadata)]
-    done += [_move_to_repaired(root, name) for name in _META if (root / name).exists()]
+    meta = {*_META, *set_files.episodes_files(root)}
+    done += [_move_to_repaired(root, name) for name in sorted(meta) if (root / name).exists()]
     if set_metadata is None:
         return [*done, f"no whole episode is left in {root}"]
     set_metadata.write(root)

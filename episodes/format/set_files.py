@@ -18,7 +18,7 @@ META_PREFIX = "touchgoal/"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 INFO = "meta/info.json"
-EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"  # the first of its files
 TASKS = "meta/tasks.parquet"
 STATS = "meta/stats.json"
 # Keys and their least values.
@@ -51,6 +51,17 @@ def video_path(key: str, file_number: int) -> str:
     return VIDEO_PATH.format(
         video_key=key, chunk_index=file_number // CHUNK, file_index=file_number % CHUNK
     )
+
+
+def episodes_path(number: int) -> str:
+    """Return the path in the set of a file of meta/episodes, counted from 0."""
+    return f"meta/episodes/chunk-{number // CHUNK:03d}/file-{number % CHUNK:03d}.parquet"
+
+
+def episodes_files(root: Path) -> list[str]:
+    """Return the paths in the set of the files of meta/episodes; without any that of the first."""
+    paths = sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet"))
+    return [path.relative_to(root).as_posix() for path in paths] or [EPISODES]
 
 
 def data_path_of(row: Row) -> str:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from touchgoal.control.features import CAMERAS, IMAGE_PREFIX
+from touchgoal.episodes.format.remote import local_folder
 from touchgoal.episodes.format.set_files import INFO
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory, open_episodes
 from touchgoal.rewards.sources.trajectory import Source
@@ -34,6 +35,7 @@ def open_source(
         with_touch: whether touch is measured.
         fps: frames per second of folders of images; None for 20.
     """
+    path = local_folder(path)
     if not path.exists():
         raise UserError(f"{path} does not exist: give a set of episodes, a video or a folder")
     key = camera if camera.startswith(IMAGE_PREFIX) else f"{IMAGE_PREFIX}{camera}"

@@ -1,0 +1,98 @@
+"""A server on this machine that answers what an S3 client asks when it lists and reads."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from email.utils import formatdate
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+from urllib.parse import parse_qs, unquote, urlsplit
+from xml.sax.saxutils import escape
+
+
+class S3Server(ThreadingHTTPServer):
+    """Buckets are the folders of `root`; `read` lists the files that were fetched, in order."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.root, self.read = root, list[str]()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+
+@contextmanager
+def s3_server(root: Path) -> Iterator[S3Server]:
+    server = S3Server(root)
+    Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: S3Server
+    protocol_version = "HTTP/1.1"
+
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
+    def do_GET(self) -> None:
+        address = urlsplit(self.path)
+        bucket, _, key = unquote(address.path).strip("/").partition("/")
+        if not (self.server.root / bucket).is_dir():
+            self._send(404, _error("NoSuchBucket", "The specified bucket does not exist"))
+        elif "list-type=2" in address.query:
+            self._list(bucket, parse_qs(address.query).get("prefix", [""])[0])
+        elif (path := self.server.root / bucket / key).is_file():
+            if self.command == "GET":
+                self.server.read.append(key)
+            self._send_file(path)
+        else:
+            self._send(404, _error("NoSuchKey", "The specified key does not exist"))
+
+    def _list(self, bucket: str, prefix: str) -> None:
+        folder = self.server.root / bucket
+        names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+        rows = "".join(
+            f"<Contents><Key>{escape(name)}</Key><LastModified>{_iso(folder / name)}</LastModified>"
+            f"<ETag>x</ETag><Size>{(folder / name).stat().st_size}</Size></Contents>"
+            for name in names
+            if name.startswith(prefix)
+        )
+        head = f"<Name>{bucket}</Name><Prefix>{escape(prefix)}</Prefix><IsTruncated>false</IsTruncated>"
+        self._send(200, f"<ListBucketResult>{head}{rows}</ListBucketResult>".encode())
+
+    def _send_file(self, path: Path) -> None:
+        data = path.read_bytes()
+        first, _, last = self.headers.get("Range", "bytes=0-").removeprefix("bytes=").partition("-")
+        part = data[int(first) : int(last or len(data)) + 1]
+        there = f"bytes {first}-{int(first) + len(part) - 1}/{len(data)}"
+        modified = formatdate(path.stat().st_mtime, usegmt=True)
+        headers = {"Content-Range": there, "Last-Modified": modified}
+        self._send(206 if "Range" in self.headers else 200, part, headers)
+
+    def _send(self, status: int, content: bytes, headers: dict[str, str] | None = None) -> None:
+        self.send_response(status)
+        for name, value in (headers or {}).items():
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(content)
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+def _iso(path: Path) -> str:
+    seconds = int(path.stat().st_mtime)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.000Z"
+
+
+def _error(code: str, message: str) -> bytes:
+    return f"<Error><Code>{code}</Code><Message>{message}</Message></Error>".encode()

@@ -1,0 +1,135 @@
+"""Sets on a remote file system: read lazily through a mirror, from an S3 server on this machine."""
+
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from lerobot_layout import write_lerobot_set
+from s3_server import S3Server, s3_server
+from test_lerobot_sets import arm_frames
+from toy_episodes import make_episode
+
+import touchgoal
+from touchgoal.control import features as ft
+from touchgoal.episodes.format import remote
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.launch.__main__ import main
+from touchgoal.runtime.errors import UserError
+
+ADDRESS = "s3://bucket/run"
+
+
+@pytest.fixture
+def s3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
+    """A bucket with a run of three episodes, and an empty cache."""
+    writer = EpisodeWriter(tmp_path / "s3/bucket/run/episodes")
+    for i in range(3):
+        writer.append(make_episode(seed=i))
+    writer.close()
+    with s3_server(tmp_path / "s3") as server:
+        for name, value in {
+            "AWS_ENDPOINT_URL": server.url,
+            "AWS_ACCESS_KEY_ID": "key",
+            "AWS_SECRET_ACCESS_KEY": "secret",
+            "AWS_DEFAULT_REGION": "us-east-1",
+            "XDG_CACHE_HOME": str(tmp_path / "cache"),
+        }.items():
+            monkeypatch.setenv(name, value)
+        remote._open.cache_clear()
+        yield server
+
+
+def data_files(server: S3Server) -> list[str]:
+    return [name for name in server.read if "/meta/" not in name]
+
+
+def test_a_file_is_fetched_when_first_read(s3: S3Server) -> None:
+    episodes = touchgoal.load_episodes(ADDRESS)
+    assert data_files(s3) == ["run/episodes/data/chunk-000/file-002.parquet"], "whose set is it"
+    local = EpisodeSet(s3.root / "bucket/run/episodes")
+    for _ in range(2):
+        for key, values in episodes.read(1).frames.items():
+            np.testing.assert_array_equal(values, local.read(1).frames[key])
+    files = data_files(s3)
+    assert len(files) == len({*files}) and not [name for name in files if "file-000" in name]
+    assert episodes.checksum == local.checksum
+    before = len(s3.read)
+    EpisodeSet(episodes.root).read(1)  # the mirror is a set like any other
+    assert len(s3.read) == before
+
+
+def test_what_changed_there_is_fetched_again(s3: S3Server) -> None:
+    EpisodeSet(ADDRESS).read(0)
+    there = s3.root / "bucket/run/episodes"
+    with pytest.raises(UserError, match="is only read: record into a local folder"):
+        EpisodeWriter(ADDRESS)
+    EpisodeWriter(there).append(make_episode(seed=7))
+    later = time.time() + 60
+    for path in (there / "meta").rglob("*.*"):
+        os.utime(path, (later, later))
+    grown = EpisodeSet(ADDRESS)
+    assert len(grown) == 4 and grown.read(3).task
+    (there / "data/chunk-000/file-001.parquet").unlink()
+    with pytest.raises(UserError, match="file-001.parquet is missing"):
+        EpisodeSet(ADDRESS)
+    with pytest.raises(UserError, match=r"s3://.*file-001.parquet does not exist"):
+        EpisodeSet(ADDRESS, complete=False).read(1)
+
+
+def test_a_full_disk_keeps_the_files_fetched_last(
+    s3: S3Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    episodes = EpisodeSet(ADDRESS)
+    episodes.read(0)
+    held = [p for p in episodes.root.rglob("file-*") if "meta" not in p.parts]
+    monkeypatch.setattr(shutil, "disk_usage", lambda root: SimpleNamespace(free=0))
+    episodes.read(1)
+    assert not [p for p in held if p.exists()], "no room: each fetch deletes all the others"
+    np.testing.assert_array_equal(
+        episodes.read(0, [ft.STATE]).frames[ft.STATE],
+        EpisodeSet(s3.root / "bucket/run/episodes").read(0).frames[ft.STATE],
+    )
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("s3://other/run", "cannot read s3://other/run .*bucket does not exist"),
+        ("s3://bucket/nothing", "s3://bucket/nothing does not exist: check the address"),
+        ("s3://bucket/run/episodes/meta", "is not a set of episodes"),
+        ("ftps://host/set", "cannot read ftps://host/set .Unrecognized filesystem"),
+        ("fsspec+nosuch://host/set", "cannot read .*nosuch"),
+    ],
+)
+def test_errors_are_one_line(s3: S3Server, address: str, message: str) -> None:
+    with pytest.raises(UserError, match=message) as error:
+        EpisodeSet(address)
+    assert "\n" not in str(error.value)
+
+
+def test_no_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    remote._open.cache_clear()
+    with pytest.raises(UserError, match="cannot read s3://bucket/set .*check the address, the net"):
+        EpisodeSet("s3://bucket/set")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process")
+def test_commands_read_lerobot_sets_there(
+    s3: S3Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, seeds in {"train": (0, 1), "validation": (9, 10)}.items():
+        write_lerobot_set(s3.root / "bucket" / name, [arm_frames(i) for i in seeds])
+    main(["reward-curves", "s3://bucket/train", "--out", str(tmp_path / "curves")])
+    assert "2 measured" in capsys.readouterr().out
+    options = "--include-unknown --task pick-place --trials 0 --train.epochs 1".split()
+    data = ["--data", "s3://bucket/train", "--validation", "s3://bucket/validation"]
+    main(["train-policy", *data, *options, "--out", str(tmp_path / "policy")])
+    assert "2 episodes for training, 2 episodes for validation" in capsys.readouterr().out
