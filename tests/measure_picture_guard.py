@@ -11,14 +11,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from test_picture_guard import FAULTS, other_light
+from test_picture_guard import FAULTS, Fault, other_light
 
 from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.picture_guard import check_presses, check_untouched
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
 from touchgoal.runtime.errors import UserError
 
-CHANGES = {"none": lambda p: p, "other light": other_light} | {k: f for k, (f, _) in FAULTS.items()}
+CHANGES: dict[str, Fault] = {"none": lambda p: p, "other light": other_light}
+CHANGES |= {name: fault for name, (fault, _) in FAULTS.items()}
 PRESSES = "none", "left to right", "exchanged", "turned"
 
 
@@ -40,12 +41,18 @@ def clips(files: Iterable[Path], step: int) -> Iterator[tuple[np.ndarray, list[n
         yield untouched, [frames[max(part, key=lambda i: strength[i])] for part in parts]
 
 
-def refused(check: Callable[[], None]) -> bool:
-    try:
-        check()
-    except UserError:
-        return True
-    return False
+def print_table(title: str, names: Iterable[str], groups: dict, check: Callable) -> None:
+    """A row a group of pictures, a column a change: how many the check refuses."""
+    print(f"\n{title:<28}{'n':>5}" + "".join(f"{name[:13]:>14}" for name in names))
+    for group, (model, items) in groups.items():
+        counts = dict.fromkeys(names, 0)
+        for item, name in ((item, name) for item in items for name in names):
+            try:
+                check([np.ascontiguousarray(CHANGES[name](p)) for p in item], model)
+            except UserError:
+                counts[name] += 1
+        row = "".join(f"{count:>14}" for count in counts.values())
+        print(f"{group:<28}{len(items):>5}{row}", flush=True)
 
 
 def main(data: Path) -> None:
@@ -60,30 +67,15 @@ def main(data: Path) -> None:
         "Mini, another, touched": (GELSIGHT_MINI, [press for _, p in minis for press in p]),
         "Minis with dots": (GELSIGHT_MINI_MARKERS, [untouched for untouched, _ in dotted]),
     }
-    print(f"{'refused pictures':<28}{'n':>5}" + "".join(f"{name[:12]:>14}" for name in CHANGES))
-    for name, (model, pictures) in groups.items():
-        counts = [
-            sum(
-                refused(lambda: check_untouched(np.ascontiguousarray(change(p)), model, "it"))  # noqa: B023
-                for p in pictures
-            )
-            for change in CHANGES.values()
-        ]
-        print(f"{name:<28}{len(pictures):>5}" + "".join(f"{c:>14}" for c in counts), flush=True)
+    alone = {name: (model, [[p] for p in pictures]) for name, (model, pictures) in groups.items()}
+    print_table("refused pictures", CHANGES, alone, lambda p, m: check_untouched(p[0], m, "it"))
     sets = {
-        "Mini, the file's unit": (GELSIGHT_MINI, [(mini[0], mini[1 + i :: 8]) for i in range(8)]),
-        "DIGIT, the file's unit": (DIGIT, [(digit[0], digit[1 + i :: 4]) for i in range(4)]),
-        "Mini, another, by clip": (GELSIGHT_MINI, minis[::3]),
+        "Mini, the file's unit": (GELSIGHT_MINI, [[mini[0], *mini[1 + i :: 8]] for i in range(8)]),
+        "DIGIT, the file's unit": (DIGIT, [[digit[0], *digit[1 + i :: 4]] for i in range(4)]),
+        "Mini, another, by clip": (GELSIGHT_MINI, [[untouched, *p] for untouched, p in minis[::3]]),
     }
-    print(f"\n{'refused sets of presses':<28}{'n':>5}" + "".join(f"{n:>14}" for n in PRESSES))
-    for name, (model, pairs) in sets.items():
-        counts = []
-        for change in (CHANGES[key] for key in PRESSES):
-            turned = [[np.ascontiguousarray(change(p)) for p in (u, *ps)] for u, ps in pairs]
-            counts.append(
-                sum(refused(lambda: check_presses(t[0], t[1:], model, "it")) for t in turned)  # noqa: B023
-            )
-        print(f"{name:<28}{len(pairs):>5}" + "".join(f"{c:>14}" for c in counts), flush=True)
+    check = lambda p, m: check_presses(p[0], p[1:], m, "it")  # noqa: E731
+    print_table("refused sets of presses", PRESSES, sets, check)
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def test_a_killed_recording_leaves_no_process_and_can_be_continued(tmp_path: Pat
 
 
 def test_ten_failures_from_the_start_stop_a_recording(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+    in_process: None, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("touchgoal.launch.collect_demos._MAX_FAILURES", 2)
     with pytest.raises(SystemExit) as stopped:

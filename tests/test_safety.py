@@ -72,13 +72,9 @@ def pushes(n: int) -> st.SearchStrategy:
     return st.lists(st.tuples(st.one_of(full, anything), st.integers(1, 12)), max_size=4)
 
 
-def _down(n: int) -> np.ndarray:
-    return np.eye(n)[1] * 1.0
-
-
 @settings(max_examples=50, deadline=None)
 @given(pushes(7))
-@example([(_down(7), 60)])  # shoulder over: fingers into the table
+@example([(np.eye(7)[1], 60)])  # shoulder over: fingers into the table
 @example([(np.full(7, 1e308), 40), (np.full(7, -1e308), 40)])  # overflows a division by dt
 @example([(np.eye(7)[0], 30), (np.full(7, np.nan), 1), (np.eye(7)[0], 5)])
 @example([(-np.eye(7)[5], 60), (np.eye(7)[5], 120)])  # wrist through its whole range
@@ -88,7 +84,7 @@ def test_nothing_leaves_the_limits_of_the_fr3(pushes: list[tuple[np.ndarray, int
 
 @settings(max_examples=30, deadline=None)
 @given(pushes(6))
-@example([(-_down(6), 80)])
+@example([(-np.eye(6)[1], 80)])
 def test_nothing_leaves_the_limits_of_the_ur5e(pushes: list[tuple[np.ndarray, int]]) -> None:
     run(LAYERS["UR5e"], [action for action, ticks in pushes for _ in range(ticks)])
 

@@ -80,28 +80,6 @@ def tracker_of(plain: np.ndarray, gel: SensorInstance) -> MarkerTracker:
     return MarkerTracker(dotted(plain, gel), DOTS, gel.pixel_pitch)
 
 
-@pytest.mark.parametrize("name", ["golf_ball", "brick", "rope_coil"])
-def test_markers_are_followed_to_half_the_pitch(gel: SensorInstance, name: str) -> None:
-    rng = np.random.default_rng(5)
-    tracker = tracker_of(render_untouched(gel, rng), gel)
-    kind = CATALOGUE[name]
-    size = (0.02, 0.02, 0.02)[: {"sphere": 1, "cylinder": 2}.get(kind.shape, 3)]
-    bench = PressBench(Body(kind, size, 0.1), DOTTED, gel)
-    bench.place(np.array([0, 0, 0.03]), turned(1, 90))
-    away = gel.markers - np.array([180, 100])
-    dragged = np.exp(-(away**2).sum(1) / (2 * 70**2))[:, None] * [13.0, -9.0]  # 15.8 px, px
-    worst, steps = 0.0, 12
-    for step in [*range(steps + 1), *range(steps, -1, -1)]:
-        moved = dragged * step / steps
-        shaded = render(bench.sense(0.3 + step, rng).surface, gel, rng)
-        now = tracker.update(dotted(shaded, gel, moved))
-        assert now.found.all() and now.found.size == 63
-        error = now.positions.reshape(-1, 2) - (gel.markers + moved)
-        worst = max(worst, float(np.linalg.norm(error, axis=1).max()))
-    assert worst < 0.3
-    assert np.linalg.norm(tracker.displacement, axis=-1).max() < 0.3
-
-
 def test_a_hidden_marker_is_flagged_and_found_again(gel: SensorInstance) -> None:
     rng = np.random.default_rng(6)
     plain = render_untouched(gel, rng)

@@ -77,14 +77,8 @@ def moves(address: str, home: list[float]) -> dict:
         time.sleep(0.5)
         held = float(np.abs(np.array(robot.state.q) - home).max())
     far = refused(np.array([2.9, *home[1:]]))
-    return {
-        "panda": panda,
-        "far": far,
-        "errors": errors,
-        "fell": fell.tolist(),
-        "turned": turned.tolist(),
-        "held": held,
-    }
+    ways = {"fell": fell.tolist(), "turned": turned.tolist()}
+    return {"panda": panda, "far": far, "errors": errors, "held": held, **ways}
 
 
 @pytest.mark.realtime
@@ -131,15 +125,9 @@ def picks(address: str, home: list[float], position: list[float], yaw: float) ->
     up = franky.Affine([0, 0, -0.12])
     robot.move(franky.CartesianMotion(up, franky.ReferenceType.Relative))
     time.sleep(0.5)
-    return {
-        "met": [met.grasped, met.width, met.fault],
-        "air": air,
-        "opened": opened,
-        "grasped": grasped and gripper.is_grasped,
-        "took": took,
-        "width": gripper.width,
-        "force": list(robot.state.O_F_ext_hat_K),
-    }
+    found = {"air": air, "opened": opened, "grasped": grasped and gripper.is_grasped, "took": took}
+    force, met = list(robot.state.O_F_ext_hat_K), [met.grasped, met.width, met.fault]
+    return {"met": met, "width": gripper.width, "force": force, **found}
 
 
 def test_franka_grasps_what_is_there(fr3: RunningTwin) -> None:
