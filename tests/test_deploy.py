@@ -31,7 +31,6 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.deploy import NOT_DONE, STOPPED
 from touchgoal.launch.twin import open_to_network
-from touchgoal.policies import checkpoint
 
 _PATIENCE = 600  # s for a loop, on a machine however loaded
 
@@ -223,19 +222,9 @@ def test_an_interrupted_pipe_keeps_the_report_and_the_status(tmp_path: Path) -> 
     assert "STOPPED: stopped by the operator" in printed and "at rest after" in printed
 
 
-def test_the_policy_is_loaded_once_and_before_anything_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    loaded, load = [], checkpoint.load
-    checkpoint._load_network.cache_clear()
-    checkpoint._load_parts.cache_clear()
-    monkeypatch.setattr(checkpoint, "load", lambda *a, **k: loaded.append(a) or load(*a, **k))
-    tips = 'fingertips = { sensor = "gelsight_mini", left = "", right = "" }\n'
-    text = tips + SIM.replace("seed = 3", "seed = 3, seconds = 0.3")
-    run("deploy", write_cell_file(tmp_path, text), "--policy", "shipped", "--out", tmp_path / "run")
-    assert len(loaded) == 1
+def test_a_policy_that_lacks_its_fingertips_is_refused_before_anything_else(tmp_path: Path) -> None:
+    path = write_cell_file(tmp_path, SIM)
     with pytest.raises(SystemExit, match="the policy feels with fingertips"):
-        path = write_cell_file(tmp_path, SIM)
         run("deploy", path, "--policy", "shipped", "--out", tmp_path / "none")
     assert not (tmp_path / "none").exists()
 

@@ -28,7 +28,7 @@ from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
-STARTS = 20
+STARTS = 10
 
 
 def drifted(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -103,7 +103,7 @@ def test_exchanged_cameras_are_noticed_where_there_is_something_to_see() -> None
         assert not cameras_exchanged(front, wrist)
         noticed += cameras_exchanged(wrist, front)
     env.close()
-    assert noticed >= 15  # of 20: a bare table tells nothing
+    assert noticed >= 7  # of 10: a bare table tells nothing
 
 
 @dataclass

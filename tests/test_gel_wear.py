@@ -41,7 +41,7 @@ def drawn(
     return np.clip(picture + share * change, 0, 255).astype(np.uint8), at
 
 
-@pytest.mark.parametrize(("name", "gels"), [("gelsight_mini", 60), ("gelsight_mini_markers", 8)])
+@pytest.mark.parametrize(("name", "gels"), [("gelsight_mini", 20), ("gelsight_mini_markers", 8)])
 def test_wear_is_seen_and_named_and_noise_and_light_are_not(name: str, gels: int) -> None:
     sensor, rng, named = find_sensor(name), np.random.default_rng(0), 0
     for gel in range(gels):
