@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-CODE := runtime control sim_envs episodes encoders rewards policies benchmarks launch tests
+CODE := runtime control sim_envs episodes encoders rewards policies benchmarks launch plugins tests
 
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
@@ -31,12 +31,15 @@ interop: $(READY)
 	.venv-interop/bin/pip install -q --no-deps franka-sim==1.1.7
 	$(BIN)/python tests/interop/run.py
 
-# Sets both ways between touchgoal and lerobot, which runs in an environment of its own, under its own pins.
+# Sets both ways between touchgoal and lerobot, and our policy in lerobot-eval; lerobot runs in an environment
+# of its own, under its own pins.
 PYTHON312 ?= python3.12
 interop-lerobot: $(READY)
 	$(PYTHON312) -m venv .venv-lerobot
 	.venv-lerobot/bin/pip install -q "lerobot[dataset,diffusion]==0.6.1"
 	$(BIN)/python tests/interop/lerobot_run.py .venv-lerobot/bin/python
+	.venv-lerobot/bin/pip install -q -e ".[towers]"
+	$(BIN)/python tests/interop/lerobot_plugins.py .venv-lerobot/bin/python
 
 # Format, lint and types.
 lint: $(READY) typings
