@@ -72,7 +72,7 @@ def checked_dataclass(cls: Class) -> Class:
         try:
             initialise(self, *args, **kwargs)
         except ValidationError as error:
-            problems = dict(reversed([_problem(e) for e in error.errors()]))  # one a field
+            problems = dict(reversed([_problem(e) for e in error.errors()]))  # one per field
             raise OptionError(cls.__name__, list(problems.items())) from None
 
     made.__init__ = checked

@@ -88,7 +88,7 @@ def _inputs(env: TaskConfig) -> dict[str, tuple[str, ...]]:
 def _audit(
     env: TaskConfig, maker: PolicyMaker, spec: EpisodeSpec, other: EpisodeSpec
 ) -> dict[str, Trial]:
-    """Run one episode as it is, and with each input of another one in turn."""
+    """Run `other` as it is, then `spec` with one input after the other taken from `other`."""
     watched: list[_Watched] = []
 
     def watch(made_for: Any) -> Actor:

@@ -58,7 +58,7 @@ class AnnotatedTouch:
     overlap: float
     """IoU of its box and the sensor's box at the contact."""
     object: str
-    """Id of the touched object: its caption, unless someone who knows better writes another."""
+    """Id of the touched object: its caption, or what a person wrote in its place."""
     dropped: dict[str, int]
     """Number of boxes that were not taken for objects, by reason."""
     contact: Contact

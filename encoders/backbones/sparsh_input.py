@@ -18,7 +18,7 @@ _GREY = 127  # grey level of an unchanged pixel: 255 * 0.5, rounded down
 
 @dataclass(frozen=True)
 class SparshPreprocessor:
-    """Change against the untouched sensor about grey, upright, 4:3, resized, 0 to 1.
+    """Input of Sparsh: an upright 4:3 image, 0 to 1, in which an untouched sensor is grey.
 
     Each channel is the change in grey levels plus 127, clipped to 0 to 255. Landscape images are
     rotated clockwise, others than 4:3 cropped about the centre, and resized bilinearly as PIL does.

@@ -27,8 +27,9 @@ class IJepa(JointEmbeddingPrediction):
     config: IJepaConfig
 
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
-        """Draw `context_ids` (count, k), cut to the smallest number in the batch, and `target_ids`
-        (count, blocks, j).
+        """Draw `context_ids` (count, k) and `target_ids` (count, blocks, j).
+
+        k is that of the image with the fewest; of other images some are dropped.
         """
         config, grid = self.config, patch_grid(self.backbone.config.vit)
         size = draw_size(grid, config.context_scale, _SQUARE, generator)

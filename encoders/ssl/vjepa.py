@@ -22,8 +22,9 @@ class VJepa(JointEmbeddingPrediction):
     config: VJepaConfig
 
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
-        """Draw `context_ids` (count, k) and `target_ids` (count, 1, j) for each mask, time by time;
-        cut to the smallest number in the batch.
+        """Draw `context_ids` (count, k) and `target_ids` (count, 1, j) for each mask, time by time.
+
+        k and j are those of the clip with the fewest; of other clips some are dropped.
         """
         config, vit = self.config, self.backbone.config.vit
         grid, times = patch_grid(vit), vit.frames // vit.tubelet

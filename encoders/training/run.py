@@ -16,10 +16,10 @@ from touchgoal.runtime.run_folder import open_run
 
 
 def check_training(options: TrainerOptions, out: Path | None, first: str = "") -> None:
-    """Check what can be checked before data are read, and take the keys of the sets.
+    """Check the options of a training before data are read, and apply --keys to all later sets.
 
-    `first` is the first training's subfolder. UserError: no such device, keys of another form, an unfit
-    folder, or no folder where one is needed.
+    `first` is the subfolder of the first training. UserError: no such device, malformed keys, an
+    unfit folder, or no folder where one is needed.
     """
     check_device(options.device)
     use_keys(options.keys)

@@ -71,7 +71,7 @@ class OptimizerConfig:
         return self.weight_decay + share * (self.final_weight_decay - self.weight_decay)
 
     def steps(self, n_samples: int) -> int:
-        """Return the number of updates of a training with `n_samples` an epoch."""
+        """Return the number of updates of a training with `n_samples` per epoch."""
         return self.epochs * (n_samples // min(self.batch_size, n_samples))
 
 
@@ -120,7 +120,7 @@ def fit(
 ) -> tuple[list[Metrics], dict[str, Any]]:
     """Train; after Ctrl-C the finished epochs can be resumed.
 
-    Writes `metrics.jsonl` (a line an epoch), TensorBoard's event files and `checkpoint.pt` (after
+    Writes `metrics.jsonl` (one line per epoch), TensorBoard's event files and `checkpoint.pt` (after
     every epoch). Returns the metrics of every epoch, and the provenance to store beside the
     weights. UserError: no such device, or a folder that does not fit `options.resume`.
 

@@ -58,7 +58,7 @@ class ForceStroke:
 
 
 def read_strokes(folder: Path, sensor: str | None = None) -> Iterator[ForceStroke]:
-    """Read the strokes of a published set, of one probe or of one batch, one batch at a time.
+    """Read the strokes in a folder (a published set, a probe or a batch), one batch at a time.
 
     UserError: no such files, another sensor's, or a content that is not as published.
     """
