@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from touchgoal.encoders.annotation.boxes import Box, Detection, Image
-from touchgoal.encoders.annotation.sensor_tracking import track_csrt
 from touchgoal.runtime.picture_file import read_picture
 
 COLOURS = {"red ball": (210, 40, 40), "green cup": (40, 190, 60), "blue box": (50, 70, 220)}
@@ -141,7 +140,7 @@ def write_scene(root: Path, scene: Scene, rng: np.random.Generator) -> list[str]
 
 
 class KnownBoxes:
-    """`AnnotationModels` that know the scenes, with the real tracker; captions name a crop's colour."""
+    """`AnnotationModels` that know the scenes; captions name a crop's colour."""
 
     names = {"detector": "true boxes", "captioner": "colours", "tracker": "CSRT"}
 
@@ -160,9 +159,6 @@ class KnownBoxes:
             self.detected += 1
             return scene.detections
         return [Detection(sensor_box(scene, frame), 0.1 if scene.fault == "no sensor" else 0.8)]
-
-    def track(self, frames: Iterable[Image], box: Box) -> list[Box | None]:
-        return track_csrt(frames, box)
 
     def caption(self, image: Image, prompt: str) -> str:
         assert prompt == "What specific object is presented in the scene?"

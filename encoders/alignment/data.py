@@ -35,6 +35,11 @@ class TouchData:
     def __len__(self) -> int:
         return len(self.label)
 
+    def take(self, rows: Int[Tensor, " b"] | Bool[Tensor, " n"]) -> "TouchData":
+        """Return some of the touches, with all images and sentences."""
+        names = "touch", "label", "contact", "view_index"
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
     def draw_sentences(self, rows: Int[Tensor, " b"], noise: BatchNoise) -> Int[Tensor, " b"]:
         """Draw one sentence (row of `texts`) for each of these touches."""
         describes = self.describes[self.label[rows]]
@@ -80,18 +85,8 @@ def split_by_episode(data: TouchData, seed: int) -> tuple[TouchData, TouchData]:
         torch.randperm(len(episodes), generator=torch.Generator().manual_seed(seed))
     ]
     by_object = shuffled[label[shuffled].argsort(stable=True)]
-    return _of_episodes(data, by_object[::2]), _of_episodes(data, by_object[1::2])
-
-
-def _of_episodes(data: TouchData, episodes: Int[Tensor, " e"]) -> TouchData:
-    rows = torch.isin(data.view_index, episodes)
-    return replace(
-        data,
-        touch=data.touch[rows],
-        label=data.label[rows],
-        contact=data.contact[rows],
-        view_index=data.view_index[rows],
-    )
+    one, other = (data.take(torch.isin(data.view_index, by_object[i::2])) for i in (0, 1))
+    return one, other
 
 
 def _sentences(

@@ -1,7 +1,7 @@
 """Annotation of recordings (MMWand, appendix A): which object is touched, and a caption for every one in view."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from touchgoal.encoders.annotation.records import (
     LeftOutRecording,
     LinesFile,
 )
+from touchgoal.encoders.annotation.sensor_tracking import track_csrt
 from touchgoal.episodes.importers.visgel import VisGelRecording
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
@@ -41,7 +42,7 @@ def annotate_all(
     Args:
         recordings: Recordings.
         root: Folder that their paths are relative to.
-        models: Detector, tracker, captioner.
+        models: Detector and captioner.
         settings: Prompts and thresholds.
         out: Folder of the run, which exists.
 
@@ -129,7 +130,7 @@ def _track_sensor(
     for first, path in enumerate(paths[:_SENSOR_SOUGHT]):
         box = settings.sensor_box or _find_sensor(_read(path), models, settings)
         if box is not None:
-            return [None] * first + models.track(_read_all(paths[first:]), box)
+            return [None] * first + track_csrt(map(_read, paths[first:]), box)
     raise LeftOut("low confidence: the sensor was not detected")
 
 
@@ -146,10 +147,6 @@ def _read(path: Path) -> Image:
     if image is None:
         raise LeftOut("an image is missing or unreadable")
     return image
-
-
-def _read_all(paths: Sequence[Path]) -> Iterator[Image]:
-    return map(_read, paths)
 
 
 def _absolute(path: Path) -> str:

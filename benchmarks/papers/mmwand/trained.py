@@ -38,15 +38,8 @@ def train(
     data: TouchData, fold: Fold, sensor: str, towers: Towers, config: AlignConfig, seed: int
 ) -> TouchEncoder:
     """Train on the training side of a fold for all epochs; nothing is chosen on the other side."""
-    rows = torch.from_numpy(fold.train)
-    own = replace(
-        data,
-        touch=data.touch[rows],
-        label=data.label[rows],
-        contact=data.contact[rows],
-        view_index=data.view_index[rows],
-        describes=data.describes & torch.from_numpy(fold.train_text),
-    )
+    own = data.take(torch.from_numpy(fold.train))
+    own = replace(own, describes=data.describes & torch.from_numpy(fold.train_text))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         encoder = TouchEncoder(
