@@ -24,6 +24,12 @@ _INSIDE = 0.9  # share of the contact's radius within which the gel follows the 
 _OUTLIER = 20e-6  # m
 
 
+def squared_distance(shape: tuple[int, ...], circle: Circle) -> Float[np.ndarray, "h w"]:
+    """Return the squared distance of each pixel of an image from the circle's centre, px^2."""
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    return (columns - circle[0]) ** 2 + (rows - circle[1]) ** 2
+
+
 def ball_overlap(shape: tuple[int, int], pitch: float, circle: Circle, ball_radius: float) -> Map:
     """Return the overlap (m) of ball and flat gel that makes the deformed gel touch in `circle`.
 
@@ -31,10 +37,8 @@ def ball_overlap(shape: tuple[int, int], pitch: float, circle: Circle, ball_radi
     over the circle is `1 - CONTACT_SHARE` of the deepest overlap. `pitch` is m per pixel; the
     ball's radius (m) must exceed the contact's.
     """
-    x, y, radius = circle
-    rows, cols = np.ogrid[: shape[0], : shape[1]]
-    square = ((cols - x) ** 2 + (rows - y) ** 2) * pitch**2
-    cap = ball_radius - math.sqrt(ball_radius**2 - (radius * pitch) ** 2)
+    square = squared_distance(shape, circle) * pitch**2
+    cap = ball_radius - math.sqrt(ball_radius**2 - (circle[2] * pitch) ** 2)
     height = np.sqrt(np.maximum(ball_radius**2 - square, 0)) - ball_radius
     overlap = np.maximum(height + cap / (1 - gel.CONTACT_SHARE), 0)
     return np.where(square < ball_radius**2, overlap, 0).astype(np.float32)
@@ -86,7 +90,7 @@ def sphere_in(depth: Map, pitch: float, circle: Circle, ball_radius: float) -> D
     """
     rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]]
     x, y, radius = circle
-    inside = (columns - x) ** 2 + (rows - y) ** 2 < (_INSIDE * radius) ** 2
+    inside = squared_distance(depth.shape, circle) < (_INSIDE * radius) ** 2
     px, py, z = columns[inside] * pitch, rows[inside] * pitch, depth[inside].astype(np.float64)
 
     def residual(at: Float[np.ndarray, "4"]) -> Float[np.ndarray, " n"]:

@@ -10,7 +10,12 @@ from jaxtyping import Bool, Float
 
 from touchgoal.control.arrays import Circle, Circles, Counts, Map, Picture
 from touchgoal.control.calibration import press_fit
-from touchgoal.control.calibration.ball import DepthErrors, press_surface, sphere_in
+from touchgoal.control.calibration.ball import (
+    DepthErrors,
+    press_surface,
+    sphere_in,
+    squared_distance,
+)
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.sensor_calibration import (
@@ -169,9 +174,8 @@ def median_background(presses: PressSet) -> Picture:
     three presses are far away, the given background is changed as its surroundings are, so that no
     seam is left.
     """
-    rows, cols = np.ogrid[: presses.background.shape[0], : presses.background.shape[1]]
-    x, y, radius = presses.circles.T[:, :, None, None]
-    far = (cols - x) ** 2 + (rows - y) ** 2 > (_FAR * radius) ** 2
+    shape = presses.background.shape
+    far = np.stack([squared_distance(shape, c) > (_FAR * c[2]) ** 2 for c in presses.circles])
     settled = presses.background.copy()
     enough = far.sum(0) >= 3
     for channel in range(3):

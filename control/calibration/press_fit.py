@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int
 
 from touchgoal.control.arrays import Circle, Circles, Picture
-from touchgoal.control.calibration.ball import press_surface
+from touchgoal.control.calibration.ball import press_surface, squared_distance
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile.sensor_calibration import (
     N_FEATURES,
@@ -263,12 +263,11 @@ def move_circles(calibration: SensorCalibration, presses: PressSet, start: Circl
 
 
 def _sample(image: Picture, background: Picture, circle: Circle) -> _Sample:
-    x, y, radius = circle
-    rows, cols = np.mgrid[: image.shape[0], : image.shape[1]]
-    reach = REGION * radius
+    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
+    reach = REGION * circle[2]
     stride = max(1, round(math.sqrt(math.pi * reach**2 / _PIXELS)))
-    near = (cols - x) ** 2 + (rows - y) ** 2 < reach**2
-    pixels = np.flatnonzero(near & (rows % stride == 0) & (cols % stride == 0))
+    near = squared_distance(image.shape, circle) < reach**2
+    pixels = np.flatnonzero(near & (rows % stride == 0) & (columns % stride == 0))
     change = image.reshape(-1, 3)[pixels].astype(np.float32) - background.reshape(-1, 3)[pixels]
     return _Sample(pixels, change)
 

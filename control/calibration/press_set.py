@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from touchgoal.control.arrays import Circle, Circles, Picture, Pictures
-from touchgoal.control.calibration.ball import find_circle
+from touchgoal.control.calibration.ball import find_circle, squared_distance
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
 
@@ -184,8 +184,7 @@ def _check_circle(
 def _check_visible(
     name: str, circle: np.ndarray, image: np.ndarray, background: np.ndarray
 ) -> None:
-    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
-    inside = (columns - circle[0]) ** 2 + (rows - circle[1]) ** 2 < circle[2] ** 2
+    inside = squared_distance(image.shape, circle) < circle[2] ** 2
     change = image[inside].astype(np.float32) - background[inside]
     if np.percentile(np.abs(change), 90) < _VISIBLE:
         raise UserError(
@@ -200,9 +199,7 @@ def without_drift(image: Picture, background: Picture, circle: Circle) -> Pictur
     Each channel loses gain and offset of a robust line through the pixels far from the contact's
     `circle` (px).
     """
-    x, y, radius = circle
-    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
-    far = (columns - x) ** 2 + (rows - y) ** 2 > (_FAR * radius) ** 2
+    far = squared_distance(image.shape, circle) > (_FAR * circle[2]) ** 2
     if far.mean() < 0.1:
         return image
     steady = np.empty_like(image)

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from touchgoal.control.arrays import AnyPicture, Circle, Counts, Picture
 from touchgoal.control.calibration import press_fit
-from touchgoal.control.calibration.ball import DepthErrors
+from touchgoal.control.calibration.ball import DepthErrors, squared_distance
 from touchgoal.control.calibration.calibrate import FittedCalibration
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration
@@ -34,9 +34,7 @@ press is: `l1_near`, peak signal-to-noise ratio (`psnr_near`, dB), similarity (`
 
 def picture_errors(measured: Picture, simulated: Counts, circle: Circle) -> PictureErrors:
     """Return the errors of a picture of a press, simulated without noise and not yet clipped."""
-    x, y, radius = circle
-    rows, columns = np.ogrid[: measured.shape[0], : measured.shape[1]]
-    near = (columns - x) ** 2 + (rows - y) ** 2 < (press_fit.REGION * radius) ** 2
+    near = squared_distance(measured.shape, circle) < (press_fit.REGION * circle[2]) ** 2
     truth, picture = measured.astype(np.float32), simulated.clip(0, 255)
     error = np.abs(picture - truth)
     return {

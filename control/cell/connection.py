@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
@@ -130,23 +130,22 @@ def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellC
     """
     robot = cell_limits(cell)
     with ExitStack() as undo:
-
-        def keep(device: Any) -> Any:
-            undo.callback(device.close)
-            return device
-
-        cameras = {}
+        cameras: dict[str, Camera] = {}
         for name, camera in cell.cameras.items():
             config = VideoConfig(
                 camera.source, camera.size, camera.rate, camera.exposure, camera.white_balance
             )
-            cameras[ft.IMAGE_PREFIX + name] = keep(VideoCamera(_timed(config, cell)))
+            video = VideoCamera(_timed(config, cell))
+            cameras[ft.IMAGE_PREFIX + name] = undo.enter_context(closing(video))
         if cell.fingertips:
             for side, key in enumerate(ft.TACTILE):
-                cameras[key] = keep(_tactile_camera(cell, cell.fingertips, side))
-        load_cell = keep(SerialLoadCell(cell.load_cell)) if cell.load_cell else None
-        gripper = keep(_gripper(cell))
-        arm = keep(connect_arm(cell, hz))
+                fingertip = _tactile_camera(cell, cell.fingertips, side)
+                cameras[key] = undo.enter_context(closing(fingertip))
+        load_cell = None
+        if cell.load_cell:
+            load_cell = undo.enter_context(closing(SerialLoadCell(cell.load_cell)))
+        gripper = undo.enter_context(closing(_gripper(cell)))
+        arm = undo.enter_context(closing(connect_arm(cell, hz)))
         clock: Clock = RealClock()
         if cell.lock_step and isinstance(gripper, FrankaHand):
             clock = LockStepClock(cell.task.twin, arm, gripper, cameras, load_cell)

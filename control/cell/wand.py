@@ -1,10 +1,10 @@
 """A real touch wand: a gel with a load cell and a camera on a stick, three cameras over the bench."""
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import field, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import UInt8
@@ -121,18 +121,14 @@ class Wand:
 def connect_wand(config: WandConfig) -> Wand:
     """Connect to all devices; UserError or DriverError if one is missing or silent."""
     with ExitStack() as undo:
-
-        def keep(device: Any) -> Any:
-            undo.callback(device.close)
-            return device
-
-        cameras = {}
+        cameras: dict[str, Camera] = {}
         for name in (key.removeprefix(ft.IMAGE_PREFIX) for key in ft.WAND_VIEWS):
             own: CameraSection = getattr(config.cameras, name)
             video = VideoConfig(own.source, own.size, own.rate, own.exposure, own.white_balance)
-            cameras[name] = keep(VideoCamera(video))
-        gel = keep(_open_gel(config.gel))
-        wand = Wand(gel, cameras, keep(SerialLoadCell(config.load_cell)))
+            cameras[name] = undo.enter_context(closing(VideoCamera(video)))
+        gel = undo.enter_context(closing(_open_gel(config.gel)))
+        load_cell = undo.enter_context(closing(SerialLoadCell(config.load_cell)))
+        wand = Wand(gel, cameras, load_cell)
         wand.read()  # raises now if a device is silent
         undo.pop_all()
     return wand

@@ -4,6 +4,7 @@ World frame = the robot's base frame, table top at z = 0.
 """
 
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -238,13 +239,13 @@ def _add_cameras_and_table(spec: mujoco.MjSpec, tool: Tool) -> None:
     longer = tool.tcp_offset - FRANKA_HAND.tcp_offset  # keeps the view of the fingers
     eye = [0.075, 0.0, 0.02 + longer]
     hand.add_camera(
-        name="wrist", pos=eye, quat=_look(eye, [0.012, 0, 0.17 + longer], [1, 0, 0]), fovy=62
+        name="wrist", pos=eye, quat=look_at(eye, [0.012, 0, 0.17 + longer], [1, 0, 0]), fovy=62
     )
     for name, eye, target, fovy in (
         ("front", [1.15, 0.0, 0.55], [0.46, 0.0, 0.10], 40),
         ("side", [0.62, -0.95, 0.42], [0.45, 0.0, 0.17], 40),
     ):
-        world.add_camera(name=name, pos=eye, quat=_look(eye, target, [0, 0, 1]), fovy=fovy)
+        world.add_camera(name=name, pos=eye, quat=look_at(eye, target, [0, 0, 1]), fovy=fovy)
     world.add_light(pos=[0.6, -0.6, 1.6], dir=[-0.1, 0.4, -1], castshadow=True, diffuse=[0.5] * 3)
     world.add_light(pos=[0.9, 0.8, 1.5], dir=[-0.3, -0.5, -1], castshadow=False, diffuse=[0.3] * 3)
     world.add_geom(
@@ -320,9 +321,9 @@ def _quaternion(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[float]:
     return quat.tolist()
 
 
-def _look(eye: list[float], target: list[float], up: list[float]) -> list[float]:
-    """Return the orientation of a camera at `eye` that looks at `target`, `up` upwards."""
-    z = np.asarray(eye) - np.asarray(target)
+def look_at(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> list[float]:
+    """Return the orientation (wxyz) of a camera at `eye` that looks at `target`, `up` upwards."""
+    z = np.subtract(eye, target)
     z = z / np.linalg.norm(z)
     x = np.cross(up, z)
     x = x / np.linalg.norm(x)

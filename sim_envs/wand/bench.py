@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from touchgoal.sim_envs.scene.build import HIDDEN_GROUP, OBJECT_GROUP, VISUAL_GROUP
+from touchgoal.sim_envs.scene.build import HIDDEN_GROUP, OBJECT_GROUP, VISUAL_GROUP, look_at
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture
 from touchgoal.sim_envs.wand.meshes import Mesh
 from touchgoal.sim_envs.wand.objects import Part, WandObject
@@ -162,7 +162,7 @@ def _add_screen(spec: mujoco.MjSpec) -> None:
     for name, eye in _EYES.items():
         up = (0, 1, 0) if name == "top" else (0, 0, 1)
         spec.worldbody.add_camera(
-            name=name, pos=eye, quat=_looking(eye, (0, 0, 0.05), up), fovy=_FOVY
+            name=name, pos=eye, quat=look_at(eye, (0, 0, 0.05), up), fovy=_FOVY
         )
 
 
@@ -251,22 +251,7 @@ def _add_wand(spec: mujoco.MjSpec) -> None:
             conaffinity=0,
         )
     eye = (-0.055, 0.0, -0.075)
-    wand.add_camera(name="wand", pos=eye, quat=_looking(eye, (0, 0, 0.005), (0, 0, -1)), fovy=70)
-
-
-def _looking(
-    eye: tuple[float, ...], target: tuple[float, ...], up: tuple[float, ...]
-) -> list[float]:
-    """Return the orientation (wxyz) of a camera at `eye` that looks at `target`."""
-    z = np.subtract(eye, target)
-    z /= np.linalg.norm(z)
-    x = np.cross(up, z)
-    x /= np.linalg.norm(x)
-    return (
-        Rotation.from_matrix(np.stack([x, np.cross(z, x), z], 1))
-        .as_quat(scalar_first=True)
-        .tolist()
-    )
+    wand.add_camera(name="wand", pos=eye, quat=look_at(eye, (0, 0, 0.005), (0, 0, -1)), fovy=70)
 
 
 def _bounds(
