@@ -211,7 +211,7 @@ def test_directory_that_is_no_clip(tmp_path: Path, clip_directory: Path) -> None
     with pytest.raises(UserError, match="must hold config.json"):
         load_towers(str(tmp_path))
     (tmp_path / "config.json").write_text('{"model_type": "bert"}')
-    with pytest.raises(UserError, match="no CLIP"):
+    with pytest.raises(UserError, match="no clip"):
         load_towers(str(tmp_path))
 
 

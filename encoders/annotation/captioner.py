@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from touchgoal.encoders.annotation.boxes import Image
-from touchgoal.encoders.annotation.pretrained_models import load_model, load_part
+from touchgoal.encoders.towers.transformers_models import load_model, load_part
 
 _MOST_TOKENS = 30
 

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from touchgoal.encoders.annotation.boxes import Detection, Image, area, clipped
-from touchgoal.encoders.annotation.pretrained_models import load_model, load_part
+from touchgoal.encoders.towers.transformers_models import load_model, load_part
 
 _LOWEST_SCORE = 0.05  # boxes below are background; the others are counted as low confidence
 

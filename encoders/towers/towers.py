@@ -1,7 +1,6 @@
 """Frozen image and text towers behind one interface."""
 
 import hashlib
-import os
 import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,6 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from touchgoal.encoders.towers import efficientnet, minilm
+from touchgoal.encoders.towers.transformers_models import load_model, load_part
 from touchgoal.encoders.towers.wheels import wheel_folder
 from touchgoal.runtime.errors import UserError
 
@@ -155,8 +155,10 @@ class ClipTowers:
 
     def __init__(self, source: str, device: str = "cpu") -> None:
         """Load the model, a folder without network access; UserError if there is no CLIP."""
-        self._model, self._tokenizer = _load_clip(source)
-        self._model.eval().requires_grad_(False).to(device)
+        self._model = load_model(source, "CLIPModel", "clip", device)
+        from transformers import AutoTokenizer
+
+        self._tokenizer = load_part(source, AutoTokenizer)
         self.device = device
         self.image_size: int = self._model.config.vision_config.image_size
         self._context: int = self._model.config.text_config.max_position_embeddings
@@ -238,35 +240,6 @@ def _in_batches(embed: Callable[[Any], T], items: Any, size: int = BATCH) -> lis
 
 def _joined(batches: list[Tensor], width: int) -> Tensor:
     return torch.cat(batches) if batches else torch.empty(0, width)
-
-
-def _load_clip(source: str) -> tuple[Any, Any]:
-    wheel_folder("transformers")
-    from transformers import AutoTokenizer, CLIPConfig, CLIPModel
-
-    local = os.path.isdir(source)
-    try:
-        config = CLIPConfig.get_config_dict(source, local_files_only=local)[0]
-        if not config:  # what transformers returns for a directory without config.json
-            raise FileNotFoundError(source)
-        if (kind := config.get("model_type")) != "clip":
-            raise UserError(f"{source} is a '{kind}', no CLIP: give a CLIP's id or directory")
-        loaded: Any = CLIPModel.from_pretrained(
-            source, local_files_only=local, dtype=torch.float32, output_loading_info=True
-        )
-        model, report = loaded
-        tokenizer = AutoTokenizer.from_pretrained(source, local_files_only=local)
-    except OSError as error:
-        hint = (
-            "it must hold config.json, model.safetensors and the tokenizer's files"
-            if local
-            else "no such directory, not in Hugging Face's cache and not to be fetched from here; "
-            f"give a local directory, or first run: hf download {source}"
-        )
-        raise UserError(f"cannot load the CLIP towers {source}: {hint}") from error
-    if report["missing_keys"]:  # transformers would leave those random
-        raise UserError(f"the weights in {source} are incomplete: fetch them again")
-    return model, tokenizer
 
 
 def _weights_hash(model: Any) -> str:

@@ -56,7 +56,7 @@ def load_part(source: str, part: Any) -> Any:
 
 def _not_found(source: str, what: str) -> UserError:
     hint = (
-        "it must hold config.json, model.safetensors, preprocessor_config.json and the tokenizer's files"
+        "it must hold config.json, model.safetensors, and the files of tokenizer and image processor"
         if os.path.isdir(source)
         else "no such directory, not in Hugging Face's cache and not to be fetched from here; "
         f"give a local directory, or first run: hf download {source}"
