@@ -18,6 +18,7 @@ from touchgoal.benchmarks.papers.mmwand.intervals import cell, mean_over_objects
 from touchgoal.encoders.alignment.described_touches import embed_grasps
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers
+from touchgoal.rewards.report.text_table import aligned
 from touchgoal.runtime.errors import UserError
 
 _FEWER = 10  # candidates
@@ -84,12 +85,8 @@ def _hits(nearer: Int[np.ndarray, " n"], objects: int, candidates: int) -> Float
 
 def _table(rows: list[dict[str, Any]], touches: int, objects: int) -> str:
     columns = [key for key in rows[0] if key != "encoder"]
-    lines = [
-        f"right object by its sentences, % [95 % over objects]: {touches} touches of {objects} objects",
-        f"{'':<40}" + "".join(f"{f'of {k}':<22}" for k in columns),
-    ]
-    lines += [
-        f"{row['encoder']:<40}" + "".join(f"{cell(row[k]):<22}" for k in columns) for row in rows
-    ]
-    lines.append(f"{'chance':<40}" + "".join(f"{100 / int(k):<22.1f}" for k in columns))
-    return "\n".join(lines)
+    what = "right object by its sentences, % [95 % over objects]"
+    lines = [["", *(f"of {k}" for k in columns)]]
+    lines += [[row["encoder"], *(cell(row[k]) for k in columns)] for row in rows]
+    lines.append(["chance", *(f"{100 / int(k):.1f}" for k in columns)])
+    return "\n".join([f"{what}: {touches} touches of {objects} objects", *aligned(lines)])

@@ -18,6 +18,7 @@ from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_ov
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.heads import Heads, PairedEmbeddings, fit_heads
 from touchgoal.encoders.alignment.splits import split_touches
+from touchgoal.rewards.report.text_table import aligned
 from touchgoal.runtime.errors import UserError
 
 PUBLISHED = """published (MMWand, Table III, VisGel), top-1 and top-5 in %, seen / unseen objects:
@@ -147,10 +148,9 @@ def _joined(pieces: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 def _table(rows: list[dict[str, Any]], objects: int) -> str:
     columns = [f"{c} top-{k}" for c in ("seen", "unseen") for k in (1, 5)]
-    lines = [
-        f"own sentence among {CANDIDATES} objects', % [95 % over objects], {objects} objects, seen ones on visits held out; "
-        f"chance {100 / CANDIDATES:.0f} and {500 / CANDIDATES:.0f}",
-        f"{'':<55}" + "".join(f"{c:>22}" for c in columns),
-    ]
-    lines += [f"{r['row']:<55}" + "".join(f"{cell(r[c]):>22}" for c in columns) for r in rows]
-    return "\n".join([*lines, "", PUBLISHED])
+    title = (
+        f"own sentence among {CANDIDATES} objects', % [95 % over objects], {objects} objects, seen ones on "
+        f"visits held out; chance {100 / CANDIDATES:.0f} and {500 / CANDIDATES:.0f}"
+    )
+    cells = [["", *columns], *([r["row"], *(cell(r[c]) for c in columns)] for r in rows)]
+    return "\n".join([title, *aligned(cells), "", PUBLISHED])

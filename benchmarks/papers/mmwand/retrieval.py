@@ -31,6 +31,7 @@ from touchgoal.encoders.alignment.splits import SPLITS, Fold, split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
+from touchgoal.rewards.report.text_table import aligned
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
 
@@ -233,12 +234,11 @@ def _table(rows: list[dict[str, Any]], pools: dict[str, dict[str, int]]) -> str:
             f"split by {split}: {pool['train']} touches to train on; {pool['test']} touches and pictures of "
             f"{pool['objects']} objects, {pool['sentences']} sentences to find"
         )
-        lines.append(f"{'':<40}" + "".join(f"{d:>22}" for d in PUBLISHED))
+        cells = [["", *PUBLISHED]]
         if split == "sample":
             for i, what in enumerate(("published", "published, without touch-text")):
-                lines.append(f"{what:<40}" + "".join(f"{v[i]:>22.2f}" for v in PUBLISHED.values()))
+                cells.append([what, *(f"{v[i]:.2f}" for v in PUBLISHED.values())])
         for row in (r for r in rows if r["split"] == split):
-            cells = (cell(row[d]) if d in row else "" for d in PUBLISHED)
-            lines.append(f"{row['row']:<40}" + "".join(f"{c:>22}" for c in cells))
-        lines.append("")
+            cells.append([row["row"], *(cell(row[d]) if d in row else "" for d in PUBLISHED)])
+        lines += [*aligned(cells), ""]
     return "\n".join(lines)

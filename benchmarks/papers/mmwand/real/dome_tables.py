@@ -24,6 +24,7 @@ from touchgoal.benchmarks.papers.mmwand.real.dome_set import (
 )
 from touchgoal.encoders.alignment.retrieval import average_precisions
 from touchgoal.encoders.probes.ridge import ridge_scores
+from touchgoal.rewards.report.text_table import aligned
 
 SPLITS: tuple[DomeSplit, ...] = ("press", "object")
 _STRENGTHS = (0.01, 0.1, 1.0)
@@ -180,21 +181,18 @@ def _retrieval_table(data: DomeSet, rows: list[dict[str, Any]]) -> str:
         "pixels outside the sensor feel nothing: what they find is the light of the session",
     ]
     for split in SPLITS:
-        lines += ["", f"{'split by ' + split:<28}" + "".join(f"{d:>28}" for d in directions)]
-        for row in (row for row in rows if row["split"] == split):
-            cells = (cell(row[d]) for d in directions)
-            lines.append(f"{row['input']:<28}" + "".join(f"{c:>28}" for c in cells))
+        own = (row for row in rows if row["split"] == split)
+        cells = [[row["input"], *(cell(row[d]) for d in directions)] for row in own]
+        lines += ["", *aligned([[f"split by {split}", *directions], *cells])]
     return "\n".join(lines)
 
 
 def _classification_table(data: DomeSet, rows: list[dict[str, Any]]) -> str:
     kinds = len(data.listed.classes)
-    lines = [
+    title = (
         f"right one of {kinds} classes on objects that were left out, % over four folds "
-        f"[95 % over objects]; chance {100 / kinds:.0f}",
-        f"{'touch by':<28}" + "".join(f"{what:>22}" for what in ("image", "touch", "both")),
-    ]
-    for row in rows:
-        cells = (cell(row[what]) for what in ("image", "touch", "both"))
-        lines.append(f"{row['input']:<28}" + "".join(f"{c:>22}" for c in cells))
-    return "\n".join(lines)
+        f"[95 % over objects]; chance {100 / kinds:.0f}"
+    )
+    inputs = "image", "touch", "both"
+    cells = [[row["input"], *(cell(row[what]) for what in inputs)] for row in rows]
+    return "\n".join([title, *aligned([["touch by", *inputs], *cells])])

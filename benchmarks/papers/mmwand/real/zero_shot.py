@@ -26,6 +26,7 @@ from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
     read_objectfolder_real,
     read_touches,
 )
+from touchgoal.rewards.report.text_table import aligned
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 
@@ -104,12 +105,10 @@ def _judge(scores: Float[np.ndarray, "n c"], truth: np.ndarray) -> dict[str, Any
 
 
 def _table(rows: list[dict[str, Any]], frequent: float, objects: int, materials: list[str]) -> str:
-    lines = [
-        f"material of {objects} real objects by sentences [95 % over objects]: {', '.join(materials)}",
-        f"{'':<40}{'right':<22}balanced",
-    ]
+    title = f"material of {objects} real objects by sentences [95 % over objects]"
+    lines = [["", "right", "balanced"]]
     for row in rows:
-        cell = "{:.2f} [{:.2f}, {:.2f}]".format(row["accuracy"], *row["interval"])
-        lines.append(f"{row['encoder']:<40}{cell:<22}{row['balanced']:.2f}")
-    lines.append(f"{'the most frequent material':<40}{frequent:<22.2f}{1 / len(materials):.2f}")
-    return "\n".join(lines)
+        right = "{:.2f} [{:.2f}, {:.2f}]".format(row["accuracy"], *row["interval"])
+        lines.append([row["encoder"], right, f"{row['balanced']:.2f}"])
+    lines.append(["the most frequent material", f"{frequent:.2f}", f"{1 / len(materials):.2f}"])
+    return "\n".join([f"{title}: {', '.join(materials)}", *aligned(lines)])
