@@ -88,7 +88,7 @@ class TrainConfig:
     warmup: Annotated[CountOrNone, RARE] = 500
     """Steps in which the learning rate rises; a tenth of the training if that is shorter."""
     snapshot_epochs: Count = 10
-    """Epochs between two snapshots of the policy; the last epoch is one too."""
+    """Epochs between two snapshots of the policy; the last epoch makes one, too."""
     validation_windows: Annotated[Count, RARE] = 1024
     """Number of validation sequences for the losses, evenly spaced."""
 

@@ -10,7 +10,8 @@ def keypoints(
 ) -> Float[Tensor, "b p"]:
     """Return the place of each keypoint (x, y in [-1, 1]) and the features there, side by side.
 
-    p is k times 2 + f. A keypoint is the mean of all cells, weighted by the softmax of its map.
+    p is k (2 + f): both coordinates and f features of each keypoint. A keypoint is the mean of all
+    cells, weighted by the softmax of its map.
     """
     share = attention.flatten(2).softmax(2)
     h, w = attention.shape[2:]

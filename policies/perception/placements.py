@@ -29,7 +29,7 @@ class Placements:
 def render_placements(
     config: PickPlaceConfig, objects: int, placements_each: int, seed: int, workers: int
 ) -> Placements:
-    """Render objects of random shape and size, one a seed from `seed` on, at several places."""
+    """Render objects of random shape and size, one for each seed from `seed` on, at several places."""
     seeds = range(seed, seed + objects)
     with one_core_workers(workers) as pool:
         rendered = pool.map(_render_object, [config] * objects, [placements_each] * objects, seeds)
