@@ -1,6 +1,6 @@
 """Detection of sets that lerobot wrote, edited or continued.
 
-touchgoal writes one data file an episode with a description in its footer, and marks the footers under
+touchgoal writes one data file per episode with a description in its footer, and marks the footers under
 meta/episodes; lerobot puts several episodes into a file, begins further files and drops the footers.
 """
 

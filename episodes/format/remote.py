@@ -28,7 +28,7 @@ _SPARE = 1 << 30  # bytes left free on the disk
 
 
 def local_folder(path: Path) -> Path:
-    """Return the folder of a set; of a remote one its mirror, whose files are as they are there now.
+    """Return the folder of a set; for a remote set that of its mirror, brought up to date.
 
     UserError: no such place, no set there, no access or no network.
     """
@@ -109,12 +109,12 @@ def _delete_outdated(root: Path, files: dict[str, fs.FileInfo]) -> None:
 
 
 def _seconds(there: fs.FileInfo) -> int:
-    """Return a file's time, s: HTTP's headers have no fractions; 0 where the client tells none."""
+    """Return a remote file's time in whole seconds, as HTTP has it; 0 if the client gives none."""
     return (there.mtime_ns or 0) // 10**9
 
 
 def _fetch(url: str, name: str, root: Path) -> None:
-    """Fetch a file into a mirror, whole or not at all; it gets the time that it has there."""
+    """Fetch a file into a mirror, whole or not at all, with the time of the remote file."""
     path = root / name
     path.parent.mkdir(parents=True, exist_ok=True)
     with _one_line_errors(f"{url}/{name}"), TemporaryDirectory(dir=root, prefix=".fetch_") as part:
@@ -134,7 +134,7 @@ def _fetch(url: str, name: str, root: Path) -> None:
 
 
 def _make_room(root: Path, size: int) -> None:
-    """Delete the episodes' files fetched first until `size` bytes and a reserve are free."""
+    """Delete files of episodes, earliest fetched first, until `size` bytes and a reserve are free."""
     if shutil.disk_usage(root).free >= size + _SPARE:
         return
     files = [p for tree in ("data", "videos") for p in (root / tree).rglob("*") if p.is_file()]

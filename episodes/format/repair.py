@@ -134,7 +134,7 @@ def _altered_meta(root: Path, found: SetMetadata, rebuilt: SetMetadata) -> list[
 
 
 def _rows(set_metadata: SetMetadata) -> Iterator[set_files.Row]:
-    """Yield the rows of meta/episodes, in whichever of its files they are."""
+    """Yield the rows of all files of meta/episodes, in order."""
     for table in set_metadata.files:
         names = [name for name in table.column_names if not name.startswith("meta/episodes/")]
         for batch in table.select(names).to_batches(max_chunksize=_ROWS):

@@ -59,7 +59,7 @@ def episodes_path(number: int) -> str:
 
 
 def episodes_files(root: Path) -> list[str]:
-    """Return the paths in the set of the files of meta/episodes; without any that of the first."""
+    """Return the paths in the set of the files of meta/episodes; of the first if there is none yet."""
     paths = sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet"))
     return [path.relative_to(root).as_posix() for path in paths] or [EPISODES]
 
