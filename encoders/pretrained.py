@@ -71,7 +71,6 @@ def find_encoder(name_or_path: str | Path, published: bool = True) -> Path:
     Args:
         name_or_path: A folder; a name of `encoder_names`, such as a sensor's; published Sparsh
             weights, as file, folder or Hugging Face id.
-        published: Accept published weights.
 
     Raises:
         UserError: No such encoder, or a published one where it is not accepted.

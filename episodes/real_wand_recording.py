@@ -35,19 +35,16 @@ def record_real_touches(
 
     Each touch is on disk before the next begins. Hints and warnings are printed.
 
+    UserError: the folder holds other touches, or a device cannot be opened or is silent.
+
     Args:
         root: folder of the set; it may hold touches of the same wand.
-        config: of the wand.
-        name: of the object.
         descriptions: how it feels, in words.
         count: touches of this object that the set shall hold; None: no end.
         new_gel: whether another gel is on the wand than at the last touch of the set.
 
     Returns:
         The set; None if it is still empty.
-
-    Raises:
-        UserError: the folder holds other touches, or a device cannot be opened or is silent.
     """
     sensor = find_sensor(config.gel.sensor)
     writer = EpisodeWriter(root, fps=FPS)

@@ -34,15 +34,10 @@ _TRIES = 2000  # random approaches before an object counts as out of reach
 def record_touches(root: Path, sensor: str, seed: int, count: int, workers: int) -> EpisodeSet:
     """Record the first `count` touches; those that the folder holds are not simulated again.
 
-    Args:
-        root: folder of the set.
-        sensor: on the wand.
-        seed: random seed of the set; touch i is the same for any count.
-        count: number of touches.
-        workers: number of processes.
+    UserError: the folder holds another set, or cannot be written to.
 
-    Raises:
-        UserError: the folder holds another set, or cannot be written to.
+    Args:
+        seed: random seed of the set; touch i is the same for any count.
     """
     config = f"{sensor}, seed {seed}"
     with closing(EpisodeWriter(root, fps=FPS)) as writer:

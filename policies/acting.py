@@ -69,11 +69,9 @@ class LearnedPolicy:
         short for this delay.
 
         Args:
-            network: for inference.
             touch: the embedder that the network was trained with.
             estimator: estimates the columns that only a simulator knows; None if there are none.
             plan_ticks: see above. On the first tick the arm stands still until the plan is there.
-            directory: see above.
         """
         self.config = config = network.config
         if (touch.name if touch else "") != config.touch:

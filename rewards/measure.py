@@ -42,7 +42,6 @@ class Measurement:
         """Find out what is measured already.
 
         Args:
-            model_of: the reward model of a trajectory.
             gamma: discount factor of the potential-based reward.
             plots: number of trajectories, from the first, that get a plot.
         """

@@ -16,7 +16,6 @@ def with_options(config: Config, options: Mapping[str, Any]) -> Config:
     UserError: there is no such field, or a value is out of its range.
 
     Args:
-        config: a dataclass.
         options: new values by field name; for a nested config (`randomization`), a config or a
             mapping of its fields that change.
     """

@@ -74,14 +74,12 @@ def calibrate_hand_eye(
 ) -> HandEye:
     """Calibrate a camera on the hand that sees a resting board, or one at rest that sees a board in the hand.
 
+    UserError: too few views, or views that do not fix the camera.
+
     Args:
         views: Corners seen in each view.
         hand_poses: Pose of the hand in the base frame for each view.
         image_size: Width and height, px.
-        on_hand: Whether the camera is on the hand.
-
-    Raises:
-        UserError: Too few views, or views that do not fix the camera.
     """
     if len(views) < MIN_VIEWS:
         raise UserError(f"{len(views)} views show the board, {MIN_VIEWS} are needed, 15 are good")

@@ -45,15 +45,12 @@ class DescribedTouches:
 def embed_grasps(encoder: AnyTouchEncoder, root: Path, frames: int, seed: int) -> DescribedTouches:
     """Embed frames with contact of episodes in which objects are grasped.
 
+    UserError: the set has no touch, no descriptions or no contact, or is another sensor's.
+
     Args:
-        encoder: of touch.
         root: episode set whose meta has `object` and `descriptions`, such as `collect-demos` records;
             it needs no cameras.
         frames: number of each episode, both fingertips together.
-        seed: random seed of the frames.
-
-    Raises:
-        UserError: the set has no touch, no descriptions or no contact, or is another sensor's.
     """
     episodes = EpisodeSet(root)
     sides = check_touches(episodes)

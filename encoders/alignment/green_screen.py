@@ -45,12 +45,10 @@ def screen_chromaticity(picture: Picture) -> Shares | None:
 def foreground(picture: Picture, known: Shares | None = None) -> Alpha:
     """Return the foreground's share of each pixel, 0 to 1.
 
-    Args:
-        picture: RGB.
-        known: the screen's colour in other pictures, for one in which an object hides the screen.
+    UserError: no green screen is seen, nor is its colour known.
 
-    Raises:
-        UserError: no green screen is seen, nor is its colour known.
+    Args:
+        known: the screen's colour in other pictures, for one in which an object hides the screen.
     """
     screen = screen_chromaticity(picture)
     screen = known if screen is None else screen
@@ -104,12 +102,10 @@ def random_background(rng: np.random.Generator) -> Picture:
 def background_changer(backgrounds: str, seed: int) -> Callable[[Picture], Picture]:
     """Return a function that replaces a picture's background by random ones.
 
+    UserError: the folder has no pictures.
+
     Args:
         backgrounds: "screen" leaves it as it is, "generated" draws them, or a folder of pictures.
-        seed: random seed.
-
-    Raises:
-        UserError: the folder has no pictures.
     """
     if backgrounds == "screen":
         return lambda picture: picture

@@ -48,7 +48,6 @@ def split_touches(
         label: object of each touch.
         visit: visit of each touch.
         describes: whether sentence j is on object i.
-        seed: random seed.
     """
     rng, every = np.random.default_rng([seed, 11]), np.ones(describes.shape[1], bool)
     if split == "object":

@@ -39,19 +39,15 @@ def annotate_all(
 
     Writes one line per recording to `annotations.jsonl`, or with the reason to `left_out.jsonl`.
 
+    UserError: a line is broken, or the lines were made by other models or settings.
+
     Args:
-        recordings: Recordings.
         root: Folder that their paths are relative to.
-        models: Detector and captioner.
-        settings: Prompts and thresholds.
         out: Folder of the run, which exists.
 
     Returns:
         Numbers over all lines: `recordings`, `annotated`, `left_out` by reason, `instances`, and `dropped`
         boxes by reason.
-
-    Raises:
-        UserError: A line is broken, or the lines were made by other models or settings.
     """
     provenance = {**models.names, **settings.as_json()}
     annotated = LinesFile(out / ANNOTATIONS, AnnotatedTouch)
@@ -77,8 +73,7 @@ def annotate(
 ) -> AnnotatedTouch:
     """Match the frames and the instance of one recording, and caption what is in view.
 
-    Raises:
-        LeftOut: It cannot be annotated.
+    LeftOut: it cannot be annotated.
     """
     touches = (_read(root / touch) for _, touch in recording.steps)
     reference_touch = root / recording.reference[1]

@@ -39,13 +39,12 @@ def match_contact(
     Noise alone puts every untouched frame at nearly the same distance from the reference. The threshold
     is `min_deformation` times the median distance of the 5 frames closest to the reference.
 
+    LeftOut: too few frames are active, or none is deformed enough.
+
     Args:
         touches: Tactile frames in time.
         reference: Tactile frame without contact.
         min_deformation: Factor of the untouched frames' distance, above 1.
-
-    Raises:
-        LeftOut: Too few frames are active, or none is deformed enough.
     """
     distances = deformations(touches, reference)
     active = np.flatnonzero(np.isfinite(distances))
@@ -64,8 +63,7 @@ def deformations(touches: Iterable[Image], reference: Image) -> Float[np.ndarray
 
     A frame is inactive if it has one colour, or repeats the reference or the frame before it.
 
-    Raises:
-        LeftOut: A frame has another size than the reference.
+    LeftOut: a frame has another size than the reference.
     """
     distances, before = [], reference
     for touch in touches:
@@ -82,12 +80,11 @@ def deformations(touches: Iterable[Image], reference: Image) -> Float[np.ndarray
 def match_reference(sensor: Sequence[Box | None]) -> int:
     """Return the first frame in which the sensor does not cover the place that it will touch.
 
+    LeftOut: the sensor is lost at the contact, or covers the place in every frame.
+
     Args:
         sensor: The sensor's box in each camera frame up to the contact frame, the last; None where it is
             not in view.
-
-    Raises:
-        LeftOut: The sensor is lost at the contact, or covers the place in every frame.
     """
     contact = sensor[-1]
     if contact is None:

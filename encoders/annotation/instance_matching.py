@@ -15,13 +15,12 @@ def select_instances(
 ) -> tuple[list[Detection], dict[str, int]]:
     """Return the objects among the detections, best first, and how many were dropped for what reason.
 
+    LeftOut: no object remains.
+
     Args:
         detections: Boxes in the reference frame.
         sensor: The sensor's box in the reference frame; None if it is not in view.
         min_score: Smallest confidence.
-
-    Raises:
-        LeftOut: No object remains.
     """
     kept: list[Detection] = []
     dropped: Counter[str] = Counter()
@@ -44,8 +43,7 @@ def match_instance(
 ) -> tuple[int, float]:
     """Return the index of the touched object and its IoU with the sensor's box at the contact.
 
-    Raises:
-        LeftOut: No object overlaps the sensor enough.
+    LeftOut: no object overlaps the sensor enough.
     """
     overlaps = [iou(instance.box, sensor) for instance in instances]
     touched = max(range(len(overlaps)), key=overlaps.__getitem__)

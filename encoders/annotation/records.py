@@ -97,8 +97,7 @@ class LinesFile(Generic[Line]):
     def read(self) -> Iterator[Line]:
         """Yield the lines, of a file that need not exist.
 
-        Raises:
-            UserError: A line is broken.
+        UserError: a line is broken.
         """
         if not self.path.exists():
             return
@@ -132,8 +131,7 @@ class LinesFile(Generic[Line]):
 def read_annotations(path: Path) -> list[AnnotatedTouch]:
     """Read the records that `annotate` wrote.
 
-    Raises:
-        UserError: There is no such file, it is empty, or a line is broken.
+    UserError: there is no such file, it is empty, or a line is broken.
     """
     records = list(LinesFile(path, AnnotatedTouch).read())
     if not records:

@@ -26,12 +26,11 @@ def annotated_touches(records: Sequence[AnnotatedTouch], sensor: str) -> Touches
     instances with that object. The view is the crop of the touched instance in a grey square of 224 px.
     Tactile images are turned and resized to the sensor's format.
 
+    UserError: an unknown sensor, or an image is missing or broken.
+
     Args:
         records: As `read_annotations` returns them.
         sensor: Name of the fingertip sensor; VisGel's is gelsight_markers.
-
-    Raises:
-        UserError: An unknown sensor, or an image is missing or broken.
     """
     find_model(sensor)
     frames, backgrounds, views, objects = [], [], [], []
@@ -58,8 +57,7 @@ def annotated_touches(records: Sequence[AnnotatedTouch], sensor: str) -> Touches
 def open_annotations(data: Path, validation: Path, sensor: str | None) -> tuple[Touches, Touches]:
     """Return the touches of two files of `annotate`, for training and validation.
 
-    Raises:
-        UserError: No sensor is named, a file is broken, or both hold the same recording.
+    UserError: no sensor is named, a file is broken, or both hold the same recording.
     """
     if sensor is None:
         raise UserError(f"{data} does not name its fingertip sensor: name it with --sensor")

@@ -153,7 +153,6 @@ def draw(touch: Float[Tensor, "n 3 h w"], scale: float) -> Float[Tensor, "n 3 h 
     """Return preprocessed frames as RGB images, 0 to 1: the change about grey, in more contrast.
 
     Args:
-        touch: preprocessed frames.
         scale: counts of change that are 1.0 in them.
     """
     return (128 + _CONTRAST * scale * touch).clamp(0, 255) / 255

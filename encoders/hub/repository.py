@@ -50,14 +50,10 @@ def push(folder: Path, repository: str, private: bool, api: "HfApi") -> str:
     The repository is made if needed; files of an earlier push that are gone here are deleted there.
     A card that lies in the folder is used in place of a new one.
 
-    Args:
-        folder: See `find_model`.
-        repository: owner/name on the Hub.
-        private: Make a new repository private.
-        api: The Hub's client.
+    UserError: no such folder, no token, no network, or the Hub refuses.
 
-    Raises:
-        UserError: No such folder, no token, no network, or the Hub refuses.
+    Args:
+        private: Make a new repository private.
     """
     from huggingface_hub import CommitOperationAdd, CommitOperationDelete, get_token
 
@@ -86,8 +82,8 @@ def pulled(repository: str, beside: Path, api: "HfApi") -> Iterator[tuple[Path, 
     Only JSON, safetensors and the card are downloaded, and each file is opened to check it. To
     keep the folder, the caller moves it.
 
-    Raises:
-        UserError: No network, no such repository, no access, a damaged file, or no model that `push` uploaded.
+    UserError: no network, no such repository, no access, a damaged file, or no model that `push`
+    uploaded.
     """
     with TemporaryDirectory(prefix=".pull_", dir=beside) as temporary:
         folder = Path(temporary) / "model"

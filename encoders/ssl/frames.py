@@ -142,7 +142,6 @@ def find_sensor_name(sensor: str | None, *sets: EpisodeSet) -> str:
 
     Args:
         sensor: Its name, for episodes that do not name theirs.
-        sets: Episode sets.
     """
     sensor = sensor or str(sets[0].meta(0).get("sensor", ""))
     if not sensor:

@@ -10,17 +10,10 @@ from touchgoal.runtime.errors import UserError
 
 
 def load_model(source: str, class_name: str, model_type: str, device: str) -> Any:
-    """Load a model of one class, frozen, in float32: some checkpoints are stored in half precision.
+    """Load a model of a class of transformers by Hugging Face id or folder, frozen, in float32.
 
-    Args:
-        source: Hugging Face id or local folder.
-        class_name: Class of transformers.
-        model_type: Its `model_type` in config.json.
-        device: Torch device.
-
-    Raises:
-        UserError: transformers is missing, there is no such model, it is another one, or its weights
-            are incomplete.
+    UserError: transformers is missing, there is no such model, it is another one, or its weights
+    are incomplete.
     """
     wheel_folder("transformers")
     import transformers
@@ -45,8 +38,7 @@ def load_model(source: str, class_name: str, model_type: str, device: str) -> An
 def load_part(source: str, part: Any) -> Any:
     """Load a tokenizer or an image processor: `part` is a class of transformers.
 
-    Raises:
-        UserError: It is not there.
+    UserError: it is not there.
     """
     try:
         return part.from_pretrained(source, local_files_only=os.path.isdir(source))

@@ -43,8 +43,7 @@ class VisGelRecording:
 def read_visgel_list(path: Path) -> list[VisGelRecording]:
     """Read the recordings of a list, in the order in which it names them first.
 
-    Raises:
-        UserError: It cannot be read, is empty, or a line has not 8 paths.
+    UserError: it cannot be read, is empty, or a line has not 8 paths.
     """
     steps: defaultdict[str, set[Step]] = defaultdict(set)
     videos: defaultdict[str, set[str]] = defaultdict(set)
@@ -79,13 +78,11 @@ def read_visgel_list(path: Path) -> list[VisGelRecording]:
 def find_root(path: Path, root: Path | None, recording: VisGelRecording) -> Path:
     """Return the folder that a list's paths are relative to.
 
+    UserError: the reference is not there.
+
     Args:
-        path: The list.
         root: Folder that the user named; None for the one that holds `data_lst`.
         recording: A recording, whose reference must be there.
-
-    Raises:
-        UserError: The reference is not there.
     """
     found = root or path.resolve().parent.parent
     if not (found / recording.reference[0]).is_file():

@@ -32,7 +32,6 @@ def open_source(
         camera: the episodes' camera, by its key or its last word ("front"); of videos, what a file
             shows that does not say so in its name.
         index: which episodes of the set; none for all.
-        with_touch: whether touch is measured.
         fps: frames per second of folders of images; None for 20.
     """
     path = local_folder(path)

@@ -38,14 +38,11 @@ class EmbeddedSet:
 def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> EmbeddedSet:
     """Embed the pictures, views and sentences of a set that `collect-touches` recorded.
 
-    Args:
-        root: its folder.
-        encoders: see `find_embedder`.
-        seed: of random weights.
-        cache: folder that keeps the embeddings.
+    UserError: no such set or encoder, or touches without views.
 
-    Raises:
-        UserError: no such set or encoder, or touches without views.
+    Args:
+        encoders: see `find_embedder`.
+        cache: folder that keeps the embeddings.
     """
     data, towers = WandSet.open(root), load_towers("offline")
     made = {name: _embed_touches(name, seed, data, cache) for name in encoders}

@@ -58,12 +58,8 @@ def fine_tune(
     """Fine-tune on the training rows; return which test rows are named rightly after the last epoch.
 
     Args:
-        network: which.
         inputs: pictures of one modality, or of several, each with a network of its own.
-        label: object of each row.
-        train, test: rows.
         epochs: passes over the training rows.
-        seed: of weights and order.
     """
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):

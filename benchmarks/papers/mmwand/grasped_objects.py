@@ -28,13 +28,11 @@ _FRAMES = 16  # of each episode, both fingertips together
 def run_grasped_objects(root: Path, encoders: Sequence[str], seed: int) -> dict[str, Any]:
     """Judge encoders on frames with contact of an episode set.
 
+    UserError: an encoder without words or of another sensor, or a set without contact.
+
     Args:
         root: episode set of `collect-demos`, whose seeds no encoder was trained on.
         encoders: names or folders of encoders with words.
-        seed: random seed of the frames.
-
-    Raises:
-        UserError: an encoder without words or of another sensor, or a set without contact.
     """
     rows, objects, touches = [], 0, 0
     for name in encoders:

@@ -36,16 +36,14 @@ def run_other_set(
 ) -> dict[str, Any]:
     """Judge touches of `data` by heads trained on it and on `other`.
 
+    UserError: the sets have other objects, or are of the same sensor.
+
     Args:
         data: touches of the wand, another sensor's.
         other: touches of the same objects.
         encoders: touch encoders, frozen, see `find_embedder`; each reads both sensors.
-        heads: training of the heads.
         seeds: number of divisions of the objects.
         cache: folder that keeps the embeddings.
-
-    Raises:
-        UserError: the sets have other objects, or are of the same sensor.
     """
     judged, first = (embed_set(root, tuple(encoders), 0, cache) for root in (data, other))
     if judged.names != first.names or judged.sentences != first.sentences:

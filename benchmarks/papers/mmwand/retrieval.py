@@ -150,8 +150,6 @@ def judge(data: EmbeddedSet, fold: Fold, embedded: dict[str, Float[np.ndarray, "
     """Judge all directions between modalities; queries without a right candidate are skipped.
 
     Args:
-        data: the set.
-        fold: the split to judge.
         embedded: unit vectors of one space: of the test touches, their pictures, the test sentences;
             two of them or all three.
     """
