@@ -15,18 +15,13 @@ MAX_FORCE = 20.0  # N
 
 @dataclass(frozen=True, eq=False)
 class WandTouch:
-    """One touch.
+    """One touch."""
 
-    Attributes:
-        before, views: view -> RGB, before contact and at contact.
-        clip: the sensor's pictures, RGB; the first is untouched.
-        load: normal force at each picture, N.
-    """
-
+    # before, views: view -> RGB, before contact and at contact
     before: dict[str, UInt8[np.ndarray, "H W 3"]]
     views: dict[str, UInt8[np.ndarray, "H W 3"]]
-    clip: UInt8[np.ndarray, "t h w 3"]
-    load: Float32[np.ndarray, " t"]
+    clip: UInt8[np.ndarray, "t h w 3"]  # the sensor's pictures, RGB; the first is untouched
+    load: Float32[np.ndarray, " t"]  # normal force at each picture, N
 
 
 def force_range(force: float) -> int:

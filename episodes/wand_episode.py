@@ -21,23 +21,14 @@ _BEFORE = 2  # frames of a clip that show the views before contact
 
 @dataclass(frozen=True)
 class Visit:
-    """One stay of an object on the bench.
+    """One stay of an object on the bench."""
 
-    Attributes:
-        origin: of the set, see `SET`.
-        sensor: on the wand.
-        object: its name.
-        descriptions: how the object feels, in words.
-        gel: which gel is on the wand.
-        number: of the visit in the set.
-    """
-
-    origin: str
-    sensor: str
-    object: str
-    descriptions: tuple[str, ...]
-    gel: int
-    number: int
+    origin: str  # of the set, see `SET`
+    sensor: str  # on the wand
+    object: str  # its name
+    descriptions: tuple[str, ...]  # how the object feels, in words
+    gel: int  # which gel is on the wand
+    number: int  # of the visit in the set
 
 
 def wand_episode(touch: WandTouch, visit: Visit, wear: GelWear | None) -> Episode:

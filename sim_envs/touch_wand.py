@@ -52,14 +52,11 @@ class TouchWandConfig:
 
 @dataclass(frozen=True, eq=False)
 class Touch(WandTouch):
-    """One simulated touch.
+    """One simulated touch."""
 
-    Attributes:
-        wrench: force (N) and torque (Nm) of the object on the gel at each picture, sensor frame.
-        point, normal: where the object is touched and its outward normal there, m, bench frame.
-    """
-
+    # force (N) and torque (Nm) of the object on the gel at each picture, sensor frame
     wrench: Float32[np.ndarray, "t 6"]
+    # point, normal: where the object is touched and its outward normal there, m, bench frame
     point: Float[np.ndarray, "3"]
     normal: Float[np.ndarray, "3"]
 

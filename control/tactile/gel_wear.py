@@ -29,17 +29,11 @@ _HOLE, _HOLE_WIDTH = 40.0, 1e-3  # counts, m: a dust grain is as strong, but sma
 
 @dataclass(frozen=True)
 class GelWear:
-    """Strongest change of a gel since its first picture.
+    """Strongest change of a gel since its first picture."""
 
-    Attributes:
-        kind: what it looks like.
-        place: (x, y) of its middle from the picture's top left corner, m.
-        length: its longer side, m.
-    """
-
-    kind: Literal["torn", "scratched", "dirty"]
-    place: tuple[float, float]
-    length: float
+    kind: Literal["torn", "scratched", "dirty"]  # what it looks like
+    place: tuple[float, float]  # (x, y) of its middle from the picture's top left corner, m
+    length: float  # its longer side, m
 
     def __str__(self) -> str:
         x, y = (1e3 * side for side in self.place)

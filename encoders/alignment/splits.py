@@ -19,15 +19,12 @@ TEST_SHARE = 1048 / 5182
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """Training and test side of a split.
+    """Training and test side of a split."""
 
-    Attributes:
-        train, test: rows of the touches.
-        train_text, test_text: whether each sentence is on that side.
-    """
-
+    # train, test: rows of the touches
     train: Int[np.ndarray, " a"]
     test: Int[np.ndarray, " b"]
+    # train_text, test_text: whether each sentence is on that side
     train_text: Bool[np.ndarray, " m"]
     test_text: Bool[np.ndarray, " m"]
 

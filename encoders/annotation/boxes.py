@@ -17,15 +17,10 @@ _GREY = (128, 128, 128)
 
 @dataclass(frozen=True)
 class Detection:
-    """A box in an image.
+    """A box in an image."""
 
-    Attributes:
-        box: In px.
-        score: Confidence of the detector, in [0, 1].
-    """
-
-    box: Box
-    score: float
+    box: Box  # in px
+    score: float  # confidence of the detector, in [0, 1]
 
 
 def area(box: Box) -> float:

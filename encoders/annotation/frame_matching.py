@@ -18,17 +18,11 @@ _UNTOUCHED = 5  # frames of a recording closest to the reference, taken as untou
 
 @dataclass(frozen=True)
 class ContactFrame:
-    """Frame of the largest deformation.
+    """Frame of the largest deformation."""
 
-    Attributes:
-        index: Index of the frame.
-        deformation: Norm of its difference to the reference frame, counts.
-        threshold: Smallest norm that counts as contact, counts.
-    """
-
-    index: int
-    deformation: float
-    threshold: float
+    index: int  # index of the frame
+    deformation: float  # norm of its difference to the reference frame, counts
+    threshold: float  # smallest norm that counts as contact, counts
 
 
 def match_contact(

@@ -25,19 +25,12 @@ Step = tuple[str, str]
 
 @dataclass(frozen=True)
 class VisGelRecording:
-    """One recording of n time steps.
+    """One recording of n time steps."""
 
-    Attributes:
-        name: Folder of its tactile images, as the list names it.
-        reference: Camera and tactile image without contact.
-        steps: Camera and tactile images in time.
-        video: All its camera images in time, at least those of `steps`.
-    """
-
-    name: str
-    reference: Step
-    steps: tuple[Step, ...]
-    video: tuple[str, ...]
+    name: str  # folder of its tactile images, as the list names it
+    reference: Step  # camera and tactile image without contact
+    steps: tuple[Step, ...]  # camera and tactile images in time
+    video: tuple[str, ...]  # all its camera images in time, at least those of `steps`
 
 
 def read_visgel_list(path: Path) -> list[VisGelRecording]:

@@ -24,45 +24,29 @@ _PRIMITIVES = ("box", "cylinder", "sphere", "capsule")
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One rigid piece of an object.
+    """One rigid piece of an object."""
 
-    Attributes:
-        shape: "box", "cylinder", "sphere", "capsule" or "mesh".
-        size: half extents as MuJoCo takes them, m; of a mesh none.
-        position: of its centre, m, in the object's frame (z up, bench at z = 0).
-        rotation: its axes in the object's frame.
-        material: how it feels, and its colour.
-        look: pattern of two colours.
-        second_rgb: the pattern's other colour.
-        mesh, coarse: vertices (m) and faces of a mesh, for the gel and for cameras.
-    """
-
-    shape: str
-    size: tuple[float, ...]
+    shape: str  # "box", "cylinder", "sphere", "capsule" or "mesh"
+    size: tuple[float, ...]  # half extents as MuJoCo takes them, m; of a mesh none
+    # of its centre, m, in the object's frame (z up, bench at z = 0)
     position: Float[np.ndarray, "3"]
-    rotation: Float[np.ndarray, "3 3"]
-    material: Material
-    look: Look
-    second_rgb: tuple[float, float, float]
+    rotation: Float[np.ndarray, "3 3"]  # its axes in the object's frame
+    material: Material  # how it feels, and its colour
+    look: Look  # pattern of two colours
+    second_rgb: tuple[float, float, float]  # the pattern's other colour
+    # mesh, coarse: vertices (m) and faces of a mesh, for the gel and for cameras
     mesh: Mesh | None
     coarse: Mesh | None
 
 
 @dataclass(frozen=True, eq=False)
 class WandObject:
-    """One object of the catalogue.
+    """One object of the catalogue."""
 
-    Attributes:
-        name: its id.
-        number: in MMWand's Table V.
-        mass: kg.
-        descriptions: how it feels, in different words.
-    """
-
-    name: str
-    number: int
-    mass: float
-    descriptions: tuple[str, ...]
+    name: str  # its id
+    number: int  # in MMWand's Table V
+    mass: float  # kg
+    descriptions: tuple[str, ...]  # how it feels, in different words
     _entry: dict[str, Any]
 
     @cached_property
