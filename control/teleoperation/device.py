@@ -17,10 +17,9 @@ Verdict = Literal["", "done", "not done"]
 class HandMotion:
     """One tick's request; axes of the base frame: x away from the robot, y left, z up."""
 
+    # motion along the axes, then turning about them, as shares of the full speeds in [-1, 1]
     twist: Float[np.ndarray, "6"]
-    """Motion along the axes, then turning about them, as shares of the full speeds in [-1, 1]."""
-    gripper: GripperRequest = ""
-    """Empty: go on as before."""
+    gripper: GripperRequest = ""  # empty: go on as before
 
 
 @runtime_checkable

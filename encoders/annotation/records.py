@@ -17,53 +17,37 @@ from touchgoal.runtime.option_types import STRICT
 class Instance:
     """An object in view."""
 
-    box: Box
-    """In the reference image, px."""
-    score: float
-    """Confidence of the detector."""
-    caption: str
-    """Answer of the captioner on the object's crop."""
+    box: Box  # in the reference image, px
+    score: float  # confidence of the detector
+    caption: str  # answer of the captioner on the object's crop
 
 
 @dataclass(frozen=True, config=STRICT)
 class Contact:
     """The frame of the largest deformation."""
 
-    image: str
-    """Camera image of that time; the sensor hides the object."""
-    sensor: Box
-    """The sensor's box in it, px."""
-    deformation: float
-    """Norm of the tactile frame's difference to the reference, counts."""
-    threshold: float
-    """Smallest norm that counts as contact, counts."""
+    image: str  # camera image of that time; the sensor hides the object
+    sensor: Box  # the sensor's box in it, px
+    deformation: float  # norm of the tactile frame's difference to the reference, counts
+    threshold: float  # smallest norm that counts as contact, counts
 
 
 @dataclass(frozen=True, config=STRICT)
 class AnnotatedTouch:
     """One touch: a line of `annotations.jsonl`. Files are named by absolute paths."""
 
-    name: str
-    """The recording."""
-    touch: str
-    """Tactile image of the contact."""
-    reference_touch: str
-    """Tactile image without contact."""
-    image: str
-    """Camera image in which the sensor does not hide the object."""
+    name: str  # the recording
+    touch: str  # tactile image of the contact
+    reference_touch: str  # tactile image without contact
+    image: str  # camera image in which the sensor does not hide the object
+    # every object in view, by confidence
     instances: Annotated[tuple[Instance, ...], Field(min_length=1)]
-    """Every object in view, by confidence."""
-    touched: Annotated[int, Field(ge=0)]
-    """Index of the touched one."""
-    overlap: float
-    """IoU of its box and the sensor's box at the contact."""
-    object: str
-    """Id of the touched object: its caption, or what a person wrote in its place."""
-    dropped: dict[str, int]
-    """Number of boxes that were not taken for objects, by reason."""
+    touched: Annotated[int, Field(ge=0)]  # index of the touched one
+    overlap: float  # IoU of its box and the sensor's box at the contact
+    object: str  # id of the touched object: its caption, or what a person wrote in its place
+    dropped: dict[str, int]  # number of boxes that were not taken for objects, by reason
     contact: Contact
-    provenance: dict[str, Any]
-    """Models, thresholds and prompts."""
+    provenance: dict[str, Any]  # models, thresholds and prompts
 
     def __post_init__(self) -> None:
         """Check the index of the touched instance."""
