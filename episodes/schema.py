@@ -41,14 +41,18 @@ def is_camera(key: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One recorded attempt at a task."""
+    """One recorded attempt at a task.
 
-    # key of `FEATURES` -> array (T, ...) in the key's dtype, one row per frame. Images are uint8
-    # RGB (T, h, w, 3). Within a set, image sizes and the arm's number of joints are equal
+    Attributes:
+        frames: Key of `FEATURES` -> array (T, ...) in the key's dtype, one row per frame. Images are
+            uint8 RGB (T, h, w, 3). Within a set, image sizes and the arm's number of joints are equal.
+        task: Instruction in words.
+        meta: Facts about the whole episode, such as object, seed and outcome; the same keys with the
+            same types in every episode of a set.
+    """
+
     frames: dict[str, np.ndarray]
-    task: str  # instruction in words
-    # facts about the whole episode, such as object, seed and outcome; the same keys with the same
-    # types in every episode of a set
+    task: str
     meta: dict[str, MetaValue] = field(default_factory=dict)
 
     def __len__(self) -> int:

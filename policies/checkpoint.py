@@ -55,11 +55,16 @@ def load(directory: Path) -> PolicyNetwork:
 
 @dataclass(frozen=True)
 class SavedPolicy:
-    """Policy on disk; called with an environment, it returns the policy for one episode of it."""
+    """Policy on disk; called with an environment, it returns the policy for one episode of it.
 
-    # of the policy, with its touch encoder in `touch/`, its state estimator in `estimator/`
+    Attributes:
+        directory: of the policy, with its touch encoder in `touch/`, its state estimator in
+            `estimator/`.
+        plan_ticks: control ticks by which its plans come late, see `LearnedPolicy`.
+    """
+
     directory: Path
-    plan_ticks: int = 0  # control ticks by which its plans come late, see `LearnedPolicy`
+    plan_ticks: int = 0
 
     def __call__(self, env: FrankaTactileEnv | None = None) -> LearnedPolicy:
         """Return the policy at an episode's beginning; its plans come as late as `env` says."""

@@ -33,32 +33,45 @@ GAMMA = 1.0
 
 @dataclass(frozen=True)
 class Contact:
-    """First contact of a fingertip."""
+    """First contact of a fingertip.
 
-    frame: int | None  # first frame in contact; None without contact
-    # "truth" (the simulator's), "detected" (from the tactile images), "no touch" (the source has no
-    # tactile images) or "not looked for" (a single tick)
+    Attributes:
+        frame: first frame in contact; None without contact.
+        label_source: "truth" (the simulator's), "detected" (from the tactile images), "no touch" (the
+            source has no tactile images) or "not looked for" (a single tick).
+    """
+
+    frame: int | None
     label_source: Literal["truth", "detected", "no touch", "not looked for"]
 
 
 @dataclass(frozen=True, repr=False)
 class Curves:
-    """The curves of one trajectory to one goal."""
+    """The curves of one trajectory to one goal.
 
-    source: str  # name of the trajectory, for people: "data/pick#3" or "video.mp4"
-    goal: Mapping[str, str]  # the goal of each modality in the form that a user writes
-    fps: float  # frames per second
-    contact: Contact  # first contact
-    # cosine distance 1 - cos in [0, 2] per frame, by modality
+    Attributes:
+        source: name of the trajectory, for people: "data/pick#3" or "video.mp4".
+        goal: the goal of each modality in the form that a user writes.
+        fps: frames per second.
+        contact: first contact.
+        raw: cosine distance 1 - cos in [0, 2] per frame, by modality.
+        normalised: distance in units of the normalizer (1 the usual start, 0 the usual end, below
+            0 nearer than that), by modality; empty without one.
+        parts: smoothed cost of each part and "fused" per frame, in [0, 1]; empty without a
+            normalizer.
+        same_episode: modalities whose goal is a frame of this trajectory itself.
+        note: which normalizer was used, or why there is none, for people.
+    """
+
+    source: str
+    goal: Mapping[str, str]
+    fps: float
+    contact: Contact
     raw: Mapping[str, Float[np.ndarray, " n"]]
-    # distance in units of the normalizer (1 the usual start, 0 the usual end, below 0 nearer than
-    # that), by modality; empty without one
     normalised: Mapping[str, Float[np.ndarray, " n"]]
-    # smoothed cost of each part and "fused" per frame, in [0, 1]; empty without a normalizer
     parts: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict)
-    # modalities whose goal is a frame of this trajectory itself
     same_episode: frozenset[str] = frozenset()
-    note: str = ""  # which normalizer was used, or why there is none, for people
+    note: str = ""
 
     def __len__(self) -> int:
         return len(next(iter(self.raw.values())))

@@ -28,21 +28,36 @@ _LIGHT_TICKS = 10  # from one look at the fingertips' light to the next
 
 @dataclass(frozen=True)
 class Trial:
-    """Result of one episode."""
+    """Result of one episode.
 
-    seed: int  # random seed of the episode
-    success: bool  # as the task defines it
-    progress: float  # the greatest reached, in [0, 1]
-    failure: str  # what ended it: drop, jam, over_force or time; "" after a success
-    peak_force: float  # greatest external force on the hand, N
-    mean_force: float  # its mean, N
-    peak_pad_force: float  # greatest normal force on a fingertip, N
-    # of the object from its goal at the end, m; None where the task has no goal position
+    Attributes:
+        seed: random seed of the episode.
+        success: as the task defines it.
+        progress: the greatest reached, in [0, 1].
+        failure: what ended it: drop, jam, over_force or time; "" after a success.
+        peak_force: greatest external force on the hand, N.
+        mean_force: its mean, N.
+        peak_pad_force: greatest normal force on a fingertip, N.
+        goal_distance: of the object from its goal at the end, m; None where the task has no goal
+            position.
+        seconds: length.
+        clamped: share of the ticks whose action was beyond the arm's or the gripper's limits.
+        light_change: largest change of a fingertip's light since the first picture, as a share.
+        episode: what distinguishes it: the object, its mass, or the wire.
+    """
+
+    seed: int
+    success: bool
+    progress: float
+    failure: str
+    peak_force: float
+    mean_force: float
+    peak_pad_force: float
     goal_distance: float | None
-    seconds: float  # length
-    clamped: float  # share of the ticks whose action was beyond the arm's or the gripper's limits
-    light_change: float  # largest change of a fingertip's light since the first picture, as a share
-    episode: dict[str, Any]  # what distinguishes it: the object, its mass, or the wire
+    seconds: float
+    clamped: float
+    light_change: float
+    episode: dict[str, Any]
 
 
 @dataclass(frozen=True)
