@@ -5,11 +5,9 @@ from jaxtyping import Float, Float32, UInt8
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Pictures = UInt8[np.ndarray, "n h w 3"]
-Counts = Float32[np.ndarray, "h w 3"]
-"""A picture that is not rounded, counts of 0 to 255."""
+Counts = Float32[np.ndarray, "h w 3"]  # a picture that is not rounded, counts of 0 to 255
 AnyPicture = Picture | Counts
-Map = Float32[np.ndarray, "h w"]
-"""Map of a gel, such as its surface (m into the gel)."""
+Map = Float32[np.ndarray, "h w"]  # map of a gel, such as its surface (m into the gel)
 Circle = Float[np.ndarray, " 3"]
 """Centre x (column), centre y (row) and radius of a contact, px; (0, 0) is the first pixel."""
 Circles = Float[np.ndarray, "n 3"]

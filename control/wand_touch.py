@@ -6,10 +6,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 VIEW_SHAPE = (224, 224)
-CLIP = 6
-"""Tactile pictures of a touch: untouched, then at a rising force, last at the largest."""
-FORCE_RANGES = ((0.0, 5.0), (5.0, 10.0), (10.0, 20.0))
-"""N, the paper's three."""
+CLIP = 6  # tactile pictures of a touch: untouched, then at a rising force, last at the largest
+FORCE_RANGES = ((0.0, 5.0), (5.0, 10.0), (10.0, 20.0))  # N, the paper's three
 MAX_FORCE = 20.0  # N
 
 

@@ -12,10 +12,8 @@ from touchgoal.control.tactile.gel_wear import GelWear
 from touchgoal.control.wand_touch import CLIP, WandTouch
 from touchgoal.episodes.schema import Episode
 
-FPS = 25
-"""Pictures a second of a GelSight Mini."""
-SET = "wand"
-"""Meta: where the touches of a set come from; sets of another origin are not continued."""
+FPS = 25  # pictures a second of a GelSight Mini
+SET = "wand"  # meta: where the touches of a set come from; sets of another origin are not continued
 _BEFORE = 2  # frames of a clip that show the views before contact
 
 

@@ -15,8 +15,7 @@ from scipy import signal, stats
 
 Curve = Real[np.ndarray, "n"]
 
-START_FRAMES = 5
-"""Frames whose median is the start value d_0."""
+START_FRAMES = 5  # frames whose median is the start value d_0
 
 EPS_FLOOR = 1e-3
 """Smallest eps, and smallest range of a curve that is not constant (curve). Before the contact a
@@ -25,8 +24,7 @@ simulated curve can be exactly flat; float rounding (about 1e-5 of a normalised 
 MIN_NOISE_FRAMES = 10
 """Fewest frames before the contact that give sigma; with fewer the whole curve is used."""
 
-DROP_FRACTION = 0.5
-"""Share of the net drop that dates a curve (`t_drop_50`, `contact_lag`)."""
+DROP_FRACTION = 0.5  # share of the net drop that dates a curve (`t_drop_50`, `contact_lag`)
 
 
 @dataclass(frozen=True)

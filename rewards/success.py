@@ -20,10 +20,8 @@ from touchgoal.rewards.distance.parts import FUSED
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
-SUCCESS = "success.json"
-"""Name of the file, beside the normalizer."""
-REJECTED = 0.1
-"""Default bound on the share of successes that are rejected."""
+SUCCESS = "success.json"  # name of the file, beside the normalizer
+REJECTED = 0.1  # default bound on the share of successes that are rejected
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,13 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 """Between 0 and 1, both included."""
 Count = Annotated[int, Field(ge=1)]
-CountOrNone = Annotated[int, Field(ge=0)]
-"""Count that may be 0."""
+CountOrNone = Annotated[int, Field(ge=0)]  # count that may be 0
 Seed = Annotated[int, Field(ge=0)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 Repository = Annotated[str, Field(pattern=r"^\w[\w.-]*/\w[\w.-]*$")]
 """Repository on the Hugging Face Hub, as owner/name."""
 
-Point = tuple[float, float]
-"""x and y in an image, px; the centre of its first pixel is (0, 0)."""
+Point = tuple[float, float]  # x and y in an image, px; the centre of its first pixel is (0, 0)
 Corners = tuple[Point, Point, Point, Point]
 """Corners of a gel in its camera's image: top left, top right, bottom left, bottom right, the order of a
 GelSight Wedge's config.csv."""
@@ -28,8 +26,7 @@ GelSight Wedge's config.csv."""
 STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 """Config of pydantic dataclasses read from a file: no conversion, no unknown key."""
 
-RARE = "rarely needed"
-"""Marks the annotation of an option that only `--help-all` shows."""
+RARE = "rarely needed"  # marks the annotation of an option that only `--help-all` shows
 
 Number = TypeVar("Number", bound=float)
 

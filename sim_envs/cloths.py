@@ -18,8 +18,7 @@ from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 
-FRAMES = 5
-"""Frames of a clip; the first is untouched."""
+FRAMES = 5  # frames of a clip; the first is untouched
 _UNEVEN = 0.1  # share of the relief that is fuzz and slubs
 _YARN = 0.06  # largest relative difference of yarn between pieces of a cloth
 _DEPTHS = (0.3e-3, 1.0e-3)  # m, at the end of a press

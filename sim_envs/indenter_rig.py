@@ -19,12 +19,9 @@ from touchgoal.sim_envs.tactile.forces import tractions
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
-FPS = 60
-"""Pictures a second, a DIGIT's."""
-FRICTION = 0.6
-"""Nominal friction coefficient, which references assume for all strokes."""
-FRICTION_SPREAD = 0.15
-"""Largest relative deviation of a stroke's friction from `FRICTION`."""
+FPS = 60  # pictures a second, a DIGIT's
+FRICTION = 0.6  # nominal friction coefficient, which references assume for all strokes
+FRICTION_SPREAD = 0.15  # largest relative deviation of a stroke's friction from `FRICTION`
 REST = 6
 """Untouched frames at the start of a stroke: the first pair of frames, 5 apart, is untouched."""
 MAX_SLIDE = 2e-3  # m

@@ -30,8 +30,7 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_in
 
 HeldObject = Literal["bar", "can"]
 HELD: tuple[HeldObject, ...] = ("bar", "can")
-FRAMES = 60
-"""Frames of a slide, after the untouched ones."""
+FRAMES = 60  # frames of a slide, after the untouched ones
 _SEGMENT = 6, 13  # frames of one velocity, half-open range
 _WINDOW = 5  # frames over which changes are drawn
 _SHIFTS, _TURNS = (0.03e-3, 8e-3), (math.radians(0.02), math.radians(4))  # least and most change

@@ -35,8 +35,7 @@ class Config(BenchmarkOptions):
     """Random seed of untrained weights."""
 
 
-RANGE = 25.0
-"""Largest force that is judged, N."""
+RANGE = 25.0  # largest force that is judged, N
 _PRESSED = 0.5  # N that count as contact
 _FIRST = 5  # untouched frames at the start
 _LASTING = 3  # frames that a fall of the cost must last

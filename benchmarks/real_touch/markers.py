@@ -31,8 +31,7 @@ class Config(BenchmarkOptions):
     """Use every n-th image."""
 
 
-NEAR = 1.0
-"""Distance within which both trackers agree, px."""
+NEAR = 1.0  # distance within which both trackers agree, px
 
 
 def run(config: Config) -> dict[str, Any]:

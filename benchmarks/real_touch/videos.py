@@ -46,8 +46,7 @@ class Config(BenchmarkOptions):
     """Random seed of untrained weights."""
 
 
-BRIGHTER = 1.1
-"""Factor of the light test."""
+BRIGHTER = 1.1  # factor of the light test
 
 
 @dataclass(frozen=True, eq=False)

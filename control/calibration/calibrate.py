@@ -25,10 +25,8 @@ from touchgoal.control.tactile.sensor_calibration import (
     shape_features,
 )
 
-ILLUMINATION_EXPONENTS = (1.0, 1.5, 2.0, 2.5)
-"""Candidates of `select_illumination_exponent`."""
-STEPS = 5
-"""How often `fit` reports progress."""
+ILLUMINATION_EXPONENTS = (1.0, 1.5, 2.0, 2.5)  # candidates of `select_illumination_exponent`
+STEPS = 5  # how often `fit` reports progress
 SQUARES_MINIMUM = 40
 """Least number of presses for `squares`; tested on 46 presses, up to six of them left out."""
 

@@ -26,8 +26,7 @@ from touchgoal.control.tactile.sensor_calibration import (
 
 REGION = 3.0
 """Radius of the region that is fitted and judged around a press, in labelled contact radii."""
-NARROWEST, WIDEST = 2.0, 0.98
-"""Contact radius: px at least, and as a share of the ball's at most."""
+NARROWEST, WIDEST = 2.0, 0.98  # contact radius: px at least, and as a share of the ball's at most
 BLUR_PYRAMID = (3.0e-3, 1.5e-3, 0.75e-3, 0.35e-3)
 """Standard deviations of Taxim's gel, m; one factor scales them all."""
 

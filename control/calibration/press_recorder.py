@@ -16,8 +16,7 @@ from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.runtime.errors import UserError
 
-GRID = 3, 4
-"""Rows and columns of the map of presses, of a picture that is wider than high."""
+GRID = 3, 4  # rows and columns of the map of presses, of a picture that is wider than high
 _SETTLING = 15  # frames without a change, 0.6 s of a 25 Hz sensor, before the first press
 _STILL = 5  # frames in which a press must stand still
 _SETTLED = 1.0  # counts of local change between the medians of the first and of the last five

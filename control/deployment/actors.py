@@ -18,8 +18,7 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.runtime.errors import UserError
 
 _SIMULATED_PLAN_TIMEOUT = 20.0  # s of wall time that a simulated arm waits for a plan
-SCRIPTED = ("expert", "follower")
-"""Names of the actors without a policy."""
+SCRIPTED = ("expert", "follower")  # names of the actors without a policy
 
 
 @runtime_checkable

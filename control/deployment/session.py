@@ -41,8 +41,7 @@ _VERDICTS = {True: "done", False: "not done", None: "unknown whether it is done"
 
 RecordEpisode = Callable[[dict[str, np.ndarray], str, dict[str, Any]], int]
 """Record frames (key -> (T, ...)), instruction and facts as an episode; return its index."""
-Truth = Callable[[], dict[str, Any]]
-"""Return what a simulator knows of its scene."""
+Truth = Callable[[], dict[str, Any]]  # return what a simulator knows of its scene
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,7 @@ _CLEARLY_MOVED = 0.75  # share of the difference that a better scale or shift ma
 _SAME_UNIT = 0.035  # difference below which the file was made from this very unit
 _OPEN = 1.5  # factor on the difference within which presses have to decide
 _EXPLAINS = 0.8  # share of the unexplained change that a better order or mirror may leave
-UNEXPLAINED = 0.65
-"""Share of a press's change that a sensor file may leave unexplained."""
+UNEXPLAINED = 0.65  # share of a press's change that a sensor file may leave unexplained
 _MAX_PRESSES, _CELL = 6, 8  # px
 _STRONGEST = 0.1  # share of the picture over which the explanation is judged
 _COARSE = 4  # px of the sensor's picture to a cell of the comparison

@@ -27,8 +27,7 @@ _SIZE = 224, 224  # rows and columns of a random background
 _PICTURES = (".png", ".jpg", ".jpeg")
 
 
-Shares = Float32[np.ndarray, "2"]
-"""Shares of red and green in a colour."""
+Shares = Float32[np.ndarray, "2"]  # shares of red and green in a colour
 
 
 def screen_chromaticity(picture: Picture) -> Shares | None:

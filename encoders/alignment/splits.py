@@ -13,8 +13,7 @@ from jaxtyping import Bool, Int
 from touchgoal.encoders.alignment.config import Split
 
 SPLITS: tuple[Split, ...] = ("sample", "press", "object", "sentence")
-TEST_SHARE = 1048 / 5182
-"""The paper's share of test touches."""
+TEST_SHARE = 1048 / 5182  # the paper's share of test touches
 
 
 @dataclass(frozen=True, eq=False)

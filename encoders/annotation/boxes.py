@@ -9,8 +9,7 @@ from jaxtyping import UInt8
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom, px; right and bottom are excluded."""
 
-Image = UInt8[np.ndarray, "h w 3"]
-"""RGB."""
+Image = UInt8[np.ndarray, "h w 3"]  # RGB
 
 _GREY = (128, 128, 128)
 

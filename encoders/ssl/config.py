@@ -18,8 +18,7 @@ from touchgoal.runtime.option_types import (
     checked_dataclass,
 )
 
-Scale = Annotated[float, Field(gt=0, le=1)]
-"""Share of the patches of an image."""
+Scale = Annotated[float, Field(gt=0, le=1)]  # share of the patches of an image
 Scales = Annotated[tuple[Scale, Scale], ORDERED]
 """Least and greatest share of the patches in a block, drawn for each batch."""
 

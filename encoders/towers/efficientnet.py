@@ -26,8 +26,7 @@ STAGES = (  # kernel, stride of the first block, expansion, output channels, rep
     (5, 2, 6, 192, 4),
     (3, 1, 6, 320, 1),
 )
-MAP_BLOCK = 10
-"""Last block at stride 16, whose features still say where in the image something is."""
+MAP_BLOCK = 10  # last block at stride 16, whose features still say where in the image something is
 _BATCH_NORM_EPS = 1e-3  # TensorFlow's default, under which the weights were trained
 
 

@@ -26,8 +26,7 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import on_interruption
 from touchgoal.runtime.provenance import command_line
 
-Metrics = dict[str, Any]
-"""Numbers by name; None where one is undefined."""
+Metrics = dict[str, Any]  # numbers by name; None where one is undefined
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import TouchClip, check_sensor, read_pictures
 from touchgoal.runtime.errors import UserError
 
-STRIDE = 5
-"""Number of images between the two of a pair: 83 ms at a DIGIT's 60 Hz."""
+STRIDE = 5  # number of images between the two of a pair: 83 ms at a DIGIT's 60 Hz
 _LABELS = "dataset_slip_forces.pkl"
 _PICTURES = re.compile(r"dataset_(digit|gelsight)_\d+\.pkl")
 _KINDS = {"digit": ("digit",), "gelsight": ("gelsight_mini", "gelsight_mini_markers")}

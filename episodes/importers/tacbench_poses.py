@@ -23,8 +23,7 @@ from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import TouchClip, encoded_pictures, read_picture_file
 from touchgoal.runtime.errors import UserError
 
-STRIDE = 5
-"""Number of images over which a motion is measured."""
+STRIDE = 5  # number of images over which a motion is measured
 _PICTURES = "digit_ring"  # the finger that the paper uses
 _MILLIMETRE = 1e-3
 _MOST_SHIFT = 1000.0  # in the file's unit

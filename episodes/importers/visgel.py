@@ -19,8 +19,7 @@ from touchgoal.runtime.errors import UserError
 _PATHS = 8
 _WORDS_IN_PATHS = "touch", "vision"  # folder names
 
-Step = tuple[str, str]
-"""Camera image and tactile image of one time, as the list names them."""
+Step = tuple[str, str]  # camera image and tactile image of one time, as the list names them
 
 
 @dataclass(frozen=True)

@@ -107,8 +107,7 @@ _KINDS: dict[str, Callable[[Frames, int, Frames], Frames]] = {
     "wrong_object": _wrong_object,
     "swapped_colours": _swapped_colours,
 }
-MADE = tuple(_KINDS)
-"""Kinds of failure that `made_failures` makes."""
+MADE = tuple(_KINDS)  # kinds of failure that `made_failures` makes
 
 
 def _length(frames: Frames) -> int:

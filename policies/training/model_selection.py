@@ -10,8 +10,7 @@ from touchgoal.policies.training.train import POLICY, SNAPSHOTS
 from touchgoal.runtime import seeds
 from touchgoal.sim_envs.config import TaskConfig
 
-Score = tuple[float, float]
-"""Success rate, then mean progress; both in [0, 1]."""
+Score = tuple[float, float]  # success rate, then mean progress; both in [0, 1]
 
 
 def select(

@@ -19,8 +19,7 @@ from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import command_line, portable
 
-END_FRAMES = 5
-"""Frames before the last one that stand for the end of a training episode."""
+END_FRAMES = 5  # frames before the last one that stand for the end of a training episode
 
 MIN_SEPARATED = 0.75
 """Least share of (episode, goal) pairs whose end must be nearer the goal than its start; 0.5 is

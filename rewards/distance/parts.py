@@ -46,8 +46,7 @@ _FORCE_FLOOR = 0.5  # N, below which the depth of a gel reads noise
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
 _SOFTNESS = 8.0  # exponent of the soft minimum
 _CHUNK = 256  # frames of maps in float32 at once
-SMOOTHING = 0.1
-"""Time constant of the causal smoothing, s."""
+SMOOTHING = 0.1  # time constant of the causal smoothing, s
 
 
 def part_distances(

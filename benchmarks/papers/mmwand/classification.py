@@ -35,8 +35,7 @@ PUBLISHED = {
     "ViT": (95.51, 76.90, 97.99),
 }
 """MMWand's Table II, %: fine-tuned on image, touch, both."""
-PUBLISHED_PROBE = 3.24, 46.94, 47.22
-"""Its linear probe on the aligned embeddings."""
+PUBLISHED_PROBE = 3.24, 46.94, 47.22  # its linear probe on the aligned embeddings
 _DECAYS = (1e-4, 1e-3, 1e-2, 1e-1)
 _PIXELS = 300  # principal components of raw pixels that the probe sees
 

@@ -23,8 +23,7 @@ from touchgoal.runtime.progress import track
 
 Network = Literal["efficientnet", "resnet", "vit"]
 Modality = Literal["image", "touch", "both"]
-SIZE = 112, 144
-"""Rows and columns of the networks' input, px."""
+SIZE = 112, 144  # rows and columns of the networks' input, px
 _BATCH = 32
 _RATES = {"efficientnet": 5e-4, "resnet": 1e-3, "vit": 1e-3}
 _DECAY = 0.05

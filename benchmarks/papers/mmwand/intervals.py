@@ -5,8 +5,7 @@ from jaxtyping import Float, Int
 
 from touchgoal.encoders.probes.property_probe import interval
 
-Interval = tuple[float, float, float]
-"""Mean and 95 % interval, %."""
+Interval = tuple[float, float, float]  # mean and 95 % interval, %
 
 
 def mean_over_objects(objects: Int[np.ndarray, " q"], value: Float[np.ndarray, " q"]) -> Interval:

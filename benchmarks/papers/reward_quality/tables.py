@@ -7,8 +7,7 @@ from touchgoal.benchmarks.papers.reward_quality.measures import Estimate, Judged
 from touchgoal.rewards.report.text_table import aligned
 from touchgoal.rewards.success import SuccessThreshold
 
-Grid = Mapping[str, Mapping[str, Estimate]]
-"""Figures by row and curve."""
+Grid = Mapping[str, Mapping[str, Estimate]]  # figures by row and curve
 
 
 def sizes(judged: Mapping[str, Sequence[Judged]], training: int) -> str:

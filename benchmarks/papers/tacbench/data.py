@@ -19,8 +19,7 @@ from touchgoal.sim_envs.cloths import CLOTHS
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import simulate
 
-STRIDE = 5
-"""Frames between the two of a pair, as in Sparsh: 83 ms at the rig's 60 Hz."""
+STRIDE = 5  # frames between the two of a pair, as in Sparsh: 83 ms at the rig's 60 Hz
 _PRESSED_IS_POSITIVE = np.array([1, 1, -1], np.float32)
 
 Rows = Int[Tensor, " _"]

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-SHARES = (1.0, 1 / 3, 0.1, 0.01)
-"""Shares of the labels."""
+SHARES = (1.0, 1 / 3, 0.1, 0.01)  # shares of the labels
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from touchgoal.sim_envs.tactile.optics import render
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, TILE_PITCH, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 
-DEPTHS = 0.15e-3, 1.3e-3
-"""Range of the indentation by a light hand, m."""
+DEPTHS = 0.15e-3, 1.3e-3  # range of the indentation by a light hand, m
 _NOTHING = -5e-3  # m: far below the gel
 
 

@@ -12,10 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-TILE = 256
-"""Cells along a texture's side."""
-TILE_PITCH = 0.1e-3
-"""m per cell of a texture: a tile shows 25.6 mm."""
+TILE = 256  # cells along a texture's side
+TILE_PITCH = 0.1e-3  # m per cell of a texture: a tile shows 25.6 mm
 
 Tile = Float32[np.ndarray, "256 256"]
 Body = Literal["flat", "ball", "cylinder", "edge", "bar", "corner"]

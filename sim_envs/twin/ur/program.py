@@ -31,10 +31,8 @@ _STILL = 1e-3  # rad/s
 _DAMPING = 1e-6  # m^2: keeps joint speeds finite near singular poses
 
 Joints = Float[np.ndarray, "6"]
-Pose = Float[np.ndarray, "6"]
-"""m, rotation vector (rad)."""
-Target = tuple[Joints, Joints]
-"""rad, rad/s."""
+Pose = Float[np.ndarray, "6"]  # m, rotation vector (rad)
+Target = tuple[Joints, Joints]  # rad, rad/s
 
 
 # How a UR moves between commands. Each motion's `step` returns the target a millisecond later.
