@@ -26,7 +26,7 @@ COMMANDS = {
     "record-demos": "lead an arm or the twin by SpaceMouse or keys, and record demonstrations",
     "annotate": "find and caption the objects that VisGel's recordings touch",
     "train-encoder": "train a touch encoder",
-    "train-estimators": "train networks that estimate contact from touch and poses from camera pictures",
+    "train-pose-estimator": "train the network that finds object and goal in a camera picture",
     "train-policy": "train a policy on recorded episodes",
     "make-policy": "make a shipped policy again: recordings, corrections, training, choice",
     "run-policy": "run a policy in a task: success rate, video",

@@ -64,7 +64,9 @@ class Config:
     """Maze only: the baseline, a regression on the wrenches that a small network, trained on the
     simulator's truth, reads from the embedding; default: diffusion on the embedding itself."""
     touch: Annotated[Path | None, RARE] = None
-    """For new pads: run folder of a touch encoder (the maze) or a state estimator (pick-place)."""
+    """Maze only, for new pads: run folder of a touch encoder."""
+    estimator: Annotated[Path | None, RARE] = None
+    """Pick-place only, for another camera: folder of a pose estimator; default: the shipped one."""
     learn_touch: bool = False
     """For new pads, maze only: first train a touch encoder without labels on the demonstrations."""
     resume: bool = False
@@ -82,10 +84,21 @@ def main(config: Config) -> None:
     from touchgoal.runtime.provenance import portable
     from touchgoal.runtime.run_folder import open_run
 
-    if config.learn_touch and (config.touch or config.task == "pick-place"):
-        raise UserError("--learn-touch goes with --task bead-maze and without --touch")
-    if config.wrench and config.task == "pick-place":
-        raise UserError("--wrench is for the maze: leave it out, or add --task bead-maze")
+    if config.learn_touch and config.touch:
+        raise UserError("--learn-touch and --touch exclude each other: leave out one")
+    other_task = (
+        [config.estimator and "--estimator"]
+        if config.task == "bead-maze"
+        else [
+            config.touch and "--touch",
+            config.learn_touch and "--learn-touch",
+            config.wrench and "--wrench",
+        ]
+    )
+    for option in filter(None, other_task):
+        raise UserError(
+            f"{option} is not for {config.task}: leave it out, or choose the other --task"
+        )
     if config.resume and config.out is None:
         raise UserError("to go on with a run, name its folder with --out")
     steps_of = _pick_place if config.task == "pick-place" else _bead_maze
@@ -131,13 +144,13 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
     from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES
 
     deployed = [*_NO_IMAGES, *_DEPLOYED]
-    run = config.touch or SHIPPED_POLICIES["pick-place"]
+    estimator = config.estimator or SHIPPED_POLICIES["pick-place"] / ESTIMATOR
     learn = shlex.split(
         "--task pick-place --representation base_twist --position-noise 0 "
         "--arm-state commanded --observation-horizon 4 "
         f"--train.lr 1e-3 --train.epochs {config.epochs or 16} --train.snapshot-epochs 16"
     )
-    learn += ["--estimator", str(run / ESTIMATOR)]
+    learn += ["--estimator", str(estimator)]
     many = config.demonstrations or 240
     disturbed = many * 7 // 16  # demonstrations of recovery
     feedback, pushed = ["--feedback", *deployed], ["--env.disturbance", "0.02"]

@@ -76,8 +76,9 @@ class Config(TrainingOptions):
     """Cameras that the policy reads, such as front wrist: keypoints of a frozen image encoder's
     feature maps, read at every plan; default: none."""
     estimator: Path | None = None
-    """Folder of a state estimator (train-estimators). The policy is trained on the simulator's contacts
-    and object poses, without images; when it acts, the estimator supplies both."""
+    """Folder of a pose estimator (train-pose-estimator). The policy is trained on the simulator's
+    contacts and object poses, without images; when it acts, contact comes from touch and the poses
+    from the estimator."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/`."""
     share: Annotated[Fraction, RARE] = 1.0
@@ -156,7 +157,7 @@ def main(config: Config) -> None:
     simulated = cast(TaskName, task) if task in ENVS else None
     trials = config.trials if simulated else 0
     env = _env(config, simulated) if simulated else None
-    reads_touch = config.encoder or config.end_to_end or config.estimator
+    reads_touch = config.encoder or config.end_to_end
     sensor = training_data.common_sensor(chosen) if reads_touch else ""
     if env is not None and trials:
         training_data.check_sensor(sensor, env.sensor)

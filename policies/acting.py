@@ -231,13 +231,8 @@ class LearnedPolicy:
                 f"{self._name} acts at {config.control_hz} Hz, not {task.control_hz}: leave out "
                 "--env.control-hz, or train a policy at that rate"
             )
-        estimator = self._learned_estimator
         sensor = find_sensor(task.sensor).name
-        trained = {
-            config.sensor,
-            self.touch and self.touch.sensor,
-            estimator and estimator.touch.sensor,
-        }
+        trained = {config.sensor, self.touch and self.touch.sensor}
         for other in trained - {"", None, sensor}:
             raise UserError(
                 f"{self._name} was trained with the sensor {other}, the task has {sensor}: choose "

@@ -117,19 +117,14 @@ class PoseEstimatorConfig:
 
 
 @checked_dataclass
-class EstimatorTrainConfig:
-    """Training of the state estimator, by AdamW."""
+class PoseTrainConfig:
+    """Training of the pose estimator, by AdamW."""
 
     epochs: Count = 20
-    """Passes over the placements, for the pose estimator."""
+    """Passes over the placements."""
     batch_size: Count = 64
     """Placements in each step."""
     lr: Positive = 2e-3
-    """Highest learning rate of the pose estimator, before a cosine to 0."""
+    """Highest learning rate, before a cosine to 0."""
     pixel_noise: CountOrNone = 4
     """Largest change of a pixel by simulated camera noise, grey levels of 255."""
-    contact_epochs: Count = 4
-    """Passes over the control ticks, for contact: 256 ticks per step, at a learning rate of 1e-3."""
-    touch_noise: NotNegative = 0.5
-    """Noise on touch embeddings in training, relative to their standard deviation, so that contact
-    is recognised with other sensors of the same model."""

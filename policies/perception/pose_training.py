@@ -1,88 +1,29 @@
-"""Training of the state estimator: contact from touch embeddings, poses from camera images."""
+"""Training of the pose estimator on rendered placements."""
 
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
-from touchgoal.control import features as ft
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
-from touchgoal.episodes.store import EpisodeSet
-from touchgoal.policies.config import Box, EstimatorTrainConfig
-from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+from touchgoal.policies.config import Box, PoseTrainConfig
 from touchgoal.policies.perception.placements import Placements
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
-from touchgoal.policies.perception.state_estimation import StateEstimatorNetwork
-from touchgoal.policies.training.embedding_cache import embed_episodes
 
 _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose counts linearly
-
-
-def embed_touch_and_contact(
-    episodes: EpisodeSet, touch: TouchEmbedder, workers: int
-) -> tuple[Float[Tensor, "n e"], Bool[Tensor, "n 2"]]:
-    """Return touch embeddings of all ticks of a set (cached on disk), and contact of each pad."""
-    rows = embed_episodes(episodes, range(len(episodes)), touch, workers)
-    truth = [episodes.read(i, [ft.TRUTH_CONTACT]).frames for i in range(len(episodes))]
-    contact = np.concatenate([frames[ft.TRUTH_CONTACT] for frames in truth])
-    return torch.from_numpy(np.concatenate(rows)).float(), torch.from_numpy(contact)
-
-
-def train_contact_estimator(
-    network: StateEstimatorNetwork,
-    touch: Float[Tensor, "n e"],
-    contact: Bool[Tensor, "n 2"],
-    config: EstimatorTrainConfig,
-    out_dir: Path,
-    options: TrainerOptions,
-    recipe: dict[str, Any],
-) -> None:
-    """Train the contact head; writes what `trainer.fit` does."""
-    sides = touch.unflatten(1, (len(ft.TACTILE), -1)).flatten(0, 1)
-    network.touch_normalizer.fit_mean_std(sides)
-    noise = config.touch_noise * network.touch_normalizer.scale.repeat(len(ft.TACTILE))
-
-    def batch(rows: Tensor, batch_noise: BatchNoise) -> dict[str, Tensor]:
-        drawn = batch_noise.randn((len(rows), touch.shape[1]))
-        return {"touch": touch[rows] + noise * drawn, "contact": contact[rows]}
-
-    training = Training(
-        loss=_ContactLoss(network),
-        n_samples=len(touch),
-        batch=batch,
-        optimizer=OptimizerConfig(
-            config.contact_epochs, 256, 1e-3, weight_decay=1e-2, warmup=0, final_lr=1
-        ),
-        identity={"train": asdict(config), "data": checksum(touch, contact)},
-        progress=lambda metrics: f"contact: loss {metrics['loss']:.4f}",
-    )
-    network.pose_estimator.requires_grad_(False)  # has its own training
-    fit(training, out_dir, options, recipe)
-    network.cpu().pose_estimator.requires_grad_(True)
-
-
-class _ContactLoss(nn.Module):
-    def __init__(self, network: StateEstimatorNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, touch: Tensor, contact: Tensor) -> dict[str, Tensor]:
-        logits = self.network.contact(touch)
-        return {"loss": F.binary_cross_entropy_with_logits(logits, contact.float())}
 
 
 def train_pose_estimator(
     estimator: PoseEstimator,
     placements: Placements,
-    config: EstimatorTrainConfig,
+    config: PoseTrainConfig,
     out_dir: Path,
     options: TrainerOptions,
     recipe: dict[str, Any],
@@ -141,14 +82,6 @@ def _add_pixel_noise(
     )
     crop.copy_((crop + added).clamp(0, 255))
     return pictures
-
-
-@torch.no_grad()
-def contact_error_rate(
-    network: StateEstimatorNetwork, touch: Float[Tensor, "n e"], contact: Bool[Tensor, "n 2"]
-) -> float:
-    """Return the share of ticks and pads with a wrong contact."""
-    return float(((network.contact(touch) > 0) != contact).float().mean())
 
 
 @torch.no_grad()

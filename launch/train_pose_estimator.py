@@ -1,0 +1,69 @@
+"""Train the pose estimator of pick-place on rendered scenes, for another camera or light."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+from touchgoal.encoders.training.options import TrainerOptions
+from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig
+from touchgoal.runtime.option_types import RARE, Count, checked_dataclass
+from touchgoal.sim_envs.config import PickPlaceConfig
+
+
+@checked_dataclass
+class Config(TrainerOptions):
+    """Options of train-pose-estimator."""
+
+    out: Path | None = None
+    """Folder of the run; the pose estimator goes to its `estimator/`."""
+    objects: Count = 1200
+    """Number of objects, of random shape and size, to render."""
+    placements: Count = 12
+    """Number of places on the table for each object."""
+    train: PoseTrainConfig = PoseTrainConfig()
+    """Epochs, learning rate, noise."""
+    pose_estimator: Annotated[PoseEstimatorConfig, RARE] = PoseEstimatorConfig()
+    """Network of the pose estimator."""
+    env: Annotated[PickPlaceConfig, RARE] = PickPlaceConfig()
+    """Options of the rendered scenes."""
+    workers: Count = os.cpu_count() or 1
+    """Processes that render."""
+
+
+def main(config: Config) -> None:
+    """Render placements, train on them, measure the errors on other ones."""
+    import torch
+
+    from touchgoal.control import features as ft
+    from touchgoal.encoders.training.run import check_training, open_training
+    from touchgoal.encoders.training.trainer import is_first_process
+    from touchgoal.policies.perception.placements import render_placements
+    from touchgoal.policies.perception.pose_estimator import PoseEstimator
+    from touchgoal.policies.perception.pose_training import pose_errors, train_pose_estimator
+    from touchgoal.policies.perception.state_estimation import ESTIMATOR_FORMAT
+    from touchgoal.runtime import seeds
+    from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.provenance import provenance
+
+    check_training(config, config.out)
+    first_seed = seeds.POSE_TRAINING.first(config.objects, "--objects")
+    out = open_training(config, "train-pose-estimator")
+    torch.manual_seed(config.seed)
+    network, known = PoseEstimator(config.pose_estimator), provenance()
+    cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in config.pose_estimator.crops)
+    size = config.pose_estimator.size
+    env = replace(config.env, tactile=False, cameras=cameras, camera_size=size)
+    rendered = render_placements(env, config.objects, config.placements, first_seed, config.workers)
+    train_pose_estimator(network, rendered, config.train, out, config, known)
+    if not is_first_process():
+        return
+    few = max(1, config.objects // 8)
+    others = render_placements(env, few, 5, seeds.POSE_VALIDATION.start, config.workers)
+    errors = pose_errors(network, others)
+    known |= {"objects": config.objects, "errors": errors}
+    ESTIMATOR_FORMAT.save_half(network, out / "estimator", network.config, known)
+    write_json(out / "metrics.json", errors)
+    for name, (middle, most) in errors.items():
+        print(f"{name.replace('_', ', ')}: {middle:.1f} (median), {most:.1f} (90 %)")
+    print(f"pose estimator: {out / 'estimator'}")
