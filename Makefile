@@ -101,8 +101,7 @@ weights-markers: $(READY)
 	cp runs/markers/run/encoder/* encoders/weights/gelsight_mini_markers/
 
 # How a shipped policy is made anew, by one command each that says what it did (recipe.json beside the
-# weights). The maze's learns its touch encoder first; with new pads pick-and-place needs `touchgoal
-# train-estimators --pose` alone. (What ships of it had other rounds, see docs/training.md.)
+# weights). The maze's learns its touch encoder first; pick-and-place needs nothing for new pads. (What ships of it had other rounds, see docs/training.md.)
 pick-place-policy: $(READY)
 	$(BIN)/touchgoal make-policy --out runs/pick_place
 	rm -rf policies/weights/pick_place && cp -r runs/pick_place/policy/policy policies/weights/pick_place

@@ -130,7 +130,7 @@ def main(config: Config) -> None:
     from touchgoal.encoders.training.trainer import is_first_process
     from touchgoal.policies.checkpoint import ESTIMATOR, TOUCH
     from touchgoal.policies.perception.frozen_touch import load_touch
-    from touchgoal.policies.perception.state_estimation import load_estimator
+    from touchgoal.policies.perception.state_estimation import load_pose_estimator
     from touchgoal.policies.training import training_data
     from touchgoal.policies.training.model_selection import copy_parts, score, select
     from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
@@ -146,7 +146,7 @@ def main(config: Config) -> None:
     touch = load_touch(config.encoder) if config.encoder else None
     parts = {TOUCH: find_encoder(config.encoder, published=False)} if config.encoder else {}
     if config.estimator:
-        load_estimator(config.estimator)
+        load_pose_estimator(config.estimator)
         parts[ESTIMATOR] = config.estimator
     sets = open_sets(config.data, config.validation)
     found = [training_data.choose_episodes(s, config.include_unknown) for s in sets]

@@ -18,7 +18,11 @@ from touchgoal.policies.network import PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_images import ImageInputConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
-from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
+from touchgoal.policies.perception.pose_estimator import PoseEstimator
+from touchgoal.policies.perception.state_estimation import (
+    StateEstimator,
+    load_pose_estimator,
+)
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 
@@ -58,7 +62,7 @@ class SavedPolicy:
     """Policy on disk; called with an environment, it returns the policy for one episode of it.
 
     Attributes:
-        directory: of the policy, with its touch encoder in `touch/`, its state estimator in
+        directory: of the policy, with its touch encoder in `touch/`, its pose estimator in
             `estimator/`.
         plan_ticks: control ticks by which its plans come late, see `LearnedPolicy`.
     """
@@ -68,7 +72,8 @@ class SavedPolicy:
 
     def __call__(self, env: FrankaTactileEnv | None = None) -> LearnedPolicy:
         """Return the policy at an episode's beginning; its plans come as late as `env` says."""
-        network, touch, estimator = _load_parts(self.directory, _stamp(self.directory))
+        network, touch, pose_estimator = _load_parts(self.directory, _stamp(self.directory))
+        estimator = StateEstimator(pose_estimator) if pose_estimator else None
         plan_ticks = max(self.plan_ticks, env.plan_ticks if env else 0)
         return LearnedPolicy(network, touch, estimator, plan_ticks, self.directory)
 
@@ -98,13 +103,13 @@ def _load_network(directory: Path, stamp: _Stamp) -> PolicyNetwork:
 @lru_cache(maxsize=4)
 def _load_parts(
     directory: Path, stamp: _Stamp
-) -> tuple[PolicyNetwork, TouchEmbedder | None, StateEstimator | None]:
+) -> tuple[PolicyNetwork, TouchEmbedder | None, PoseEstimator | None]:
     network = _load_network(directory, stamp)
     config = network.config
     with torch.random.fork_rng(devices=[]):
         touch = load_touch_of(directory / TOUCH, config.touch) if config.touch_dim else None
-        estimator = load_estimator(directory / ESTIMATOR) if config.estimated else None
-    return network, touch, estimator
+        pose_estimator = load_pose_estimator(directory / ESTIMATOR) if config.estimated else None
+    return network, touch, pose_estimator
 
 
 def load_policy(name_or_path: str | Path) -> LearnedPolicy:

@@ -12,7 +12,6 @@ from toy_policies import (
     toy_dataset,
     toy_observations,
     toy_policy,
-    toy_touch_embedder,
 )
 
 from touchgoal.control import features as ft
@@ -21,22 +20,12 @@ from touchgoal.episodes.recording import CORRECTED, EpisodeSpec, record_episode
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SavedPolicy
-from touchgoal.policies.config import EstimatorTrainConfig, PoseEstimatorConfig
+from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig
 from touchgoal.policies.perception.placements import Placements
+from touchgoal.policies.perception.pose_estimator import PoseEstimator
+from touchgoal.policies.perception.pose_training import pose_errors, train_pose_estimator
 from touchgoal.policies.perception.proprioception import network_input
-from touchgoal.policies.perception.state_estimation import (
-    ESTIMATED,
-    ESTIMATOR_FORMAT,
-    StateEstimator,
-    StateEstimatorConfig,
-    StateEstimatorNetwork,
-    load_estimator,
-)
-from touchgoal.policies.perception.training import (
-    pose_errors,
-    train_contact_estimator,
-    train_pose_estimator,
-)
+from touchgoal.policies.perception.state_estimation import ESTIMATED, StateEstimator
 from touchgoal.policies.training.dagger import DaggerRoles
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
@@ -55,10 +44,7 @@ SMALL = PoseEstimatorConfig(
 
 def toy_estimator() -> StateEstimator:
     torch.manual_seed(0)
-    touch = toy_touch_embedder()
-    return StateEstimator(
-        StateEstimatorNetwork(StateEstimatorConfig(touch.name, touch.dim, SMALL)).eval(), touch
-    )
+    return StateEstimator(PoseEstimator(SMALL).eval())
 
 
 def test_the_start_is_seen_from_the_hand() -> None:
@@ -78,16 +64,6 @@ def test_the_start_is_seen_from_the_hand() -> None:
         np.testing.assert_allclose(observed, expected, atol=1e-6)
 
 
-def train_contact(count: int, epochs: int, out: Path) -> float:
-    """Train the contact head on embeddings with one number of each fingertip; return its accuracy."""
-    touch = torch.randn(count, 6, generator=torch_rng())
-    contact = torch.stack([touch[:, 0] > 0, touch[:, 3] > 0], 1)
-    network = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL))
-    config = EstimatorTrainConfig(contact_epochs=epochs, touch_noise=0.1)
-    train_contact_estimator(network, touch, contact, config, out, TrainerOptions(), {})
-    return float(((network.contact(touch) > 0) == contact).float().mean())
-
-
 def train_pose(count: int, epochs: int, out: Path) -> float:
     """Train the pose estimator on bright spots on grey; return the median error, mm."""
     spots = torch.randint(0, 14, (count, 2), generator=torch_rng())
@@ -99,34 +75,28 @@ def train_pose(count: int, epochs: int, out: Path) -> float:
     start[:, :2] = spots / 100
     tcp = torch.randn(count, 7, generator=torch_rng())
     placements = Placements({ft.FRONT: pictures}, tcp, start)
-    sight = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL)).pose_estimator
-    config = EstimatorTrainConfig(epochs=epochs, lr=1e-2)
+    sight = PoseEstimator(SMALL)
+    config = PoseTrainConfig(epochs=epochs, lr=1e-2)
     train_pose_estimator(sight, placements, config, out, TrainerOptions(), {})
     return pose_errors(sight, placements)["object_mm"][0]
 
 
-def test_contact_is_learnt(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    assert train_contact(4000, 100, tmp_path) > 0.9
-
-
-def test_contact_is_true_or_false() -> None:
-    estimator, observed = toy_estimator(), toy_observations(1)[0]
-    observed |= {ft.FRONT: np.zeros((16, 16, 3), np.uint8)}
-    contact = estimator.estimate(observed, observed)[ft.TRUTH_CONTACT]
-    assert contact.dtype == np.float32 and set(contact.tolist()) <= {0.0, 1.0}
+def test_contact_is_the_simulators_in_every_tick() -> None:
+    env = PickPlace(PickPlaceConfig(camera_size=(16, 16), cameras=("front",)))
+    episode = record_episode(env, EpisodeSpec(4, options={"object": "wooden_block"}))
+    frames, estimator = episode.frames, toy_estimator()
+    ticks = [{k: v[i] for k, v in frames.items()} for i in range(len(frames[ft.ACTION]))]
+    found = np.stack([estimator.estimate(tick, ticks[0])[ft.TRUTH_CONTACT] for tick in ticks])
+    assert frames[ft.TRUTH_CONTACT].any(0).all() and not frames[ft.TRUTH_CONTACT][0].any()
+    np.testing.assert_array_equal(found, frames[ft.TRUTH_CONTACT])
+    estimator.estimate(ticks[40], ticks[0])
+    again = ticks[0] | {}  # another episode begins
+    assert not estimator.estimate(again, again)[ft.TRUTH_CONTACT].any()
 
 
 def test_a_place_is_learnt(tmp_path: Path) -> None:
     torch.manual_seed(0)
     assert train_pose(256, 75, tmp_path) < 15  # 60 by chance
-
-
-def test_estimators_survive_the_disk(tmp_path: Path) -> None:
-    estimator = toy_estimator()
-    ESTIMATOR_FORMAT.save_half(estimator.network, tmp_path, estimator.network.config, {})
-    with pytest.raises(UserError, match="trained with the touch encoder toy, .*train-estimators"):
-        load_estimator(tmp_path)  # finds the shipped touch encoder
 
 
 def test_a_policy_acts_on_its_senses() -> None:

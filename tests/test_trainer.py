@@ -117,10 +117,10 @@ test_trainer.train_everything(Path(sys.argv[1]))
 def trainings() -> dict[str, Callable[[Path], object]]:
     """Every trainer at toy size, two epochs of a few steps each, given a folder."""
     import test_align
-    import test_estimators
     import test_jepa
     import test_mae
     import test_self_distillation
+    import test_state_estimation
     import toy_policies
     from toy_touches import moving_blobs
 
@@ -150,8 +150,7 @@ def trainings() -> dict[str, Callable[[Path], object]]:
         "diffusion": partial(policy, toy_policies.DIFFUSION),
         "flow": partial(policy, toy_policies.FLOW),
         "regression": partial(policy, MLPConfig(width=16)),
-        "contact": lambda out: test_estimators.train_contact(256, 2, out),
-        "pose": lambda out: test_estimators.train_pose(64, 2, out),
+        "pose": lambda out: test_state_estimation.train_pose(64, 2, out),
     }
 
 
@@ -161,7 +160,7 @@ def test_fits_in_closed_form_refuse_torchrun(monkeypatch: pytest.MonkeyPatch) ->
         train_encoder.main(train_encoder.Surfaces())
 
 
-TRAINERS = "mae dino ijepa vjepa align diffusion flow regression contact pose".split()
+TRAINERS = "mae dino ijepa vjepa align diffusion flow regression pose".split()
 
 
 def train_everything(out: Path) -> None:

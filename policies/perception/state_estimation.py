@@ -76,11 +76,11 @@ class StateEstimator:
         return torch.from_numpy(picture)[None]
 
 
-def load_estimator(directory: Path) -> StateEstimator:
-    """Read a state estimator; UserError: nothing there, or damaged."""
+def load_pose_estimator(directory: Path) -> PoseEstimator:
+    """Read a pose estimator for inference; UserError: nothing there, or damaged."""
     network = PoseEstimator(ESTIMATOR_FORMAT.read_config(directory, _config))
     ESTIMATOR_FORMAT.load_weights(network, directory)
-    return StateEstimator(network.eval())
+    return network
 
 
 def _config(fields: dict[str, Any]) -> PoseEstimatorConfig:

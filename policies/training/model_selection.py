@@ -45,6 +45,6 @@ def score(policy: Path, env: TaskConfig, trials: int, workers: int) -> Score:
 
 
 def copy_parts(policy: Path, parts: Mapping[str, Path]) -> None:
-    """Copy folders beside a policy's weights, by name: its touch encoder, its state estimator."""
+    """Copy folders beside a policy's weights, by name: its touch encoder, its pose estimator."""
     for name, folder in parts.items():
         shutil.copytree(folder, policy / name, dirs_exist_ok=True)
