@@ -114,7 +114,6 @@ def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("policy", "options", "message"),
     [
-        ("shipped", {"sensor": "digit"}, r"--env\.sensor gelsight_mini"),
         ("shipped", {"tactile": False}, r"--env\.no-tactile: .* runs with --env\.tactile; leave"),
         ("shipped", {"cameras": ()}, r"--env\.cameras: .* runs with --env\.cameras front"),
         (
@@ -282,7 +281,7 @@ def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
 
 def test_shipped_records_name_no_folder_of_a_machine() -> None:
     records = list(SHIPPED_POLICIES["pick-place"].parent.rglob("*.json"))
-    assert len(records) == 8
+    assert len(records) == 7
     for path in records:
         record = json.loads(path.read_text())
         assert portable(record) == record
