@@ -78,6 +78,3 @@ def test_what_cannot_be_audited_is_refused() -> None:
     own = replace(goal(one), same_episode=frozenset({"tactile"}))
     with pytest.raises(UserError, match="is a frame of itself"):
         audit_touch([one, one], [own, own], measure)
-    without = replace(one, touch=None, sides=())
-    with pytest.raises(UserError, match="no touch to audit"):
-        audit_touch([without, without], [goal(one)] * 2, measure)

@@ -1,6 +1,4 @@
-"""Curve metrics against hand-computed values, brute-force definitions and the known traps."""
-
-from itertools import combinations
+"""Curve metrics against hand-computed values and the known traps."""
 
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ from hypothesis import strategies as st
 
 from touchgoal.rewards.metrics import (
     EPS_FLOOR,
-    CurveMetrics,
     find_peaks,
     kendall_tau_b,
     largest_rebound,
@@ -25,34 +22,6 @@ CURVES = st.lists(st.integers(-6, 6), min_size=3, max_size=24).map(
 STEP = np.where(np.arange(100) < 50, 1.0, 0.0)
 
 
-def brute_kendall(x: np.ndarray, y: np.ndarray) -> float | None:
-    pairs = list(combinations(range(len(x)), 2))
-    agreement = sum(np.sign((x[j] - x[i]) * (y[j] - y[i])) for i, j in pairs)
-    apart_x = sum(x[j] != x[i] for i, j in pairs)
-    apart_y = sum(y[j] != y[i] for i, j in pairs)
-    return agreement / (apart_x * apart_y) ** 0.5 if apart_x and apart_y else None
-
-
-def brute_peaks(d: np.ndarray, eps: float) -> list[int]:
-    """Walk from every run of equal values outwards, by the definition."""
-    found = []
-    for first in range(1, len(d) - 1):
-        last = first
-        while last + 1 < len(d) and d[last + 1] == d[first]:
-            last += 1
-        if last == len(d) - 1 or not d[first - 1] < d[first] > d[last + 1]:
-            continue
-        bases = []
-        for step, edge in ((-1, first), (1, last)):
-            lowest, at = d[first], edge
-            while 0 <= at < len(d) and d[at] <= d[first]:
-                lowest, at = min(lowest, d[at]), at + step
-            bases.append(lowest)
-        if d[first] - max(bases) >= eps:
-            found.append((first + last) // 2)
-    return found
-
-
 def test_correlations_by_hand() -> None:
     x, y = np.array([1.0, 2.0, 2.0, 3.0]), np.array([1.0, 3.0, 2.0, 4.0])
     # Ranks centred: (-1.5, 0, 0, 1.5) and (-1.5, .5, -.5, 1.5): 4.5 / sqrt(4.5 * 5).
@@ -61,17 +30,10 @@ def test_correlations_by_hand() -> None:
     assert kendall_tau_b(x, y) == pytest.approx(5 / 30**0.5)
 
 
-@given(CURVES)
-def test_kendall_is_its_definition(x: np.ndarray) -> None:
-    time = np.arange(len(x))
-    expected = brute_kendall(x, time)
-    assert kendall_tau_b(x, time) == (None if expected is None else pytest.approx(expected))
-    assert kendall_tau_b(x, np.round(x)) == pytest.approx(brute_kendall(x, np.round(x)))
-
-
-@given(CURVES, st.sampled_from([0.25, 0.5, 1.0, 2.0]))
-def test_peaks_are_their_definition(d: np.ndarray, eps: float) -> None:
-    assert find_peaks(d, eps).tolist() == brute_peaks(d, eps)
+def test_peaks_by_hand() -> None:
+    """A plateau is one peak, at its middle; ends are none; prominence is over the higher base."""
+    d = np.array([3.0, 1.0, 2.0, 2.0, 2.0, 1.5, 2.5, 0.0, 0.2, 0.0, 3.0])
+    assert find_peaks(d, 0.5).tolist() == [3, 6] and find_peaks(d, 1.0).tolist() == [6]
 
 
 @given(CURVES)
@@ -103,27 +65,8 @@ def test_flat_window_makes_no_peak_of_rounding() -> None:
     assert (m.sigma, m.eps, m.peaks) == (0, EPS_FLOOR, 0)
 
 
-def test_one_eps_for_several_curves() -> None:
-    bumps = np.linspace(1, 0, 100) + 0.1 * np.sin(np.arange(100))
-    assert measure_curve(bumps, None, eps=0.05).peaks > 10
-    assert measure_curve(bumps, None, eps=0.5).peaks == 0
-
-
 @pytest.mark.parametrize("wiggle", [0.0, 1e-7])
 def test_constant_curve_is_undefined_not_perfect(wiggle: float) -> None:
     m = measure_curve(0.7 + wiggle * np.sin(np.arange(60)), contact=None)
     assert (m.spearman, m.kendall_tau_b, m.t_drop_10, m.t_drop_50) == (None,) * 4
     assert m.area == pytest.approx(0.7)
-
-
-def test_metrics_go_to_json_by_name() -> None:
-    d = measure_curve(STEP, contact=50).as_dict()
-    assert d["contact_lag"] == 0 and CurveMetrics(**d) == measure_curve(STEP, contact=50)
-
-
-@pytest.mark.parametrize(
-    ("d", "contact"), [([1.0], None), ([1.0, float("nan")], None), ([1.0, 0.0], 2)]
-)
-def test_what_is_no_curve_is_refused(d: list[float], contact: int | None) -> None:
-    with pytest.raises(ValueError, match=r"frame|finite"):
-        measure_curve(np.array(d), contact)

@@ -1,6 +1,5 @@
 """Episodes and goals through tiny encoders: pictures, touch and words become curves."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT, WRIST
+from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
@@ -21,10 +20,7 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.rewards.distance.embedding_distance import compute_curves, compute_distances
 from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
 from touchgoal.rewards.goals import (
-    EpisodeEnd,
-    Goal,
     GoalPicture,
-    GoalSpec,
     Modality,
     OwnFrame,
     Sentence,
@@ -80,26 +76,20 @@ def embedder() -> EpisodeEmbedder:
     return EpisodeEmbedder(towers, encoder)
 
 
-def choose(specs: Sequence[GoalSpec], available: Sequence[Modality] = ALL) -> Goal:
-    return assign_goals(specs, available)
-
-
 def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:
     e = embedder.embed_episode(recorded(), 20.0, "mine", descriptions=True)
     assert e.modalities == ALL and (e.object, e.success) == ("apple", True)
-    goal = choose([OwnFrame(), Sentence("hard and smooth")], e.modalities)
+    goal = assign_goals([OwnFrame(), Sentence("hard and smooth")], e.modalities)
     curves = compute_curves(e, embedder.embed_goal(goal, e), None)
     assert set(curves.raw) == set(ALL) and not curves.normalised
     assert curves.raw["image"][-1] == pytest.approx(0, abs=1e-6)
     assert np.ptp(curves.raw["tactile"][:7]) < 1e-6 < 1e-4 < curves.raw["tactile"][0]
     assert curves.raw["tactile"][7:] == pytest.approx(np.zeros(5), abs=1e-6)
-    assert e.descriptions is not None and embedder.embed_goal(goal, e).text is not None
+    assert e.descriptions is not None
     assert embedder.embed_goal(goal, e).text == pytest.approx(e.descriptions[:1], abs=1e-6)
 
-    third = embedder.embed_goal(choose([OwnFrame(3)], e.modalities), e)
+    third = embedder.embed_goal(assign_goals([OwnFrame(3)], e.modalities), e)
     assert compute_distances(e, third)["image"].argmin() == 3
-    with pytest.raises(UserError, match="frames are 0 to 11"):
-        embedder.embed_goal(choose([OwnFrame(12)], e.modalities), e)
 
 
 def test_goals_from_a_picture_and_from_another_episode(
@@ -112,28 +102,23 @@ def test_goals_from_a_picture_and_from_another_episode(
     other = embedder.embed_episode(stored, 20.0, "set#1")
     mine = embedder.embed_episode(recorded(color=160), 20.0, "mine")
     spec = parse_goal(f"episode:{tmp_path / 'set'}#1")
-    end = embedder.embed_goal(choose([spec], ALL), mine)
+    end = embedder.embed_goal(assign_goals([spec], ALL), mine)
     assert other.touch is not None and end.touch is not None and end.image is not None
     assert end.image[0] == pytest.approx(other.pictures()[-1], abs=1e-5)
     assert end.touch == pytest.approx(other.touch[:, -1:], abs=1e-5)
-    with pytest.raises(UserError, match="episodes 0 to 1"):
-        embedder.embed_goal(choose([EpisodeEnd(tmp_path / "set", 2)], ALL), mine)
 
     Image.fromarray(stored.frames[FRONT][-1]).save(tmp_path / "end.png")
-    picture = embedder.embed_goal(choose([GoalPicture(tmp_path / "end.png")], ALL), mine)
+    picture = embedder.embed_goal(assign_goals([GoalPicture(tmp_path / "end.png")], ALL), mine)
     assert picture.touch is None and picture.image is not None
     assert picture.image[0] == pytest.approx(other.pictures()[-1], abs=1e-5)
     (tmp_path / "end.png").write_text("no picture")
     with pytest.raises(UserError, match=r"end\.png cannot be read"):
         GoalPicture(tmp_path / "end.png").read()
-    with pytest.raises(UserError, match="does not exist"):
-        GoalPicture(tmp_path / "none.png").read()
 
 
 def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
-    encoder = TouchEncoder(
-        TouchEncoderConfig.for_towers(PRESETS["tiny"], PaintTowers("oil"), "gelsight_mini", 16)
-    )
+    oil = PaintTowers("oil")
+    encoder = TouchEncoder(TouchEncoderConfig.for_towers(PRESETS["tiny"], oil, "gelsight_mini", 16))
     with pytest.raises(UserError, match="trained with the towers oil, not paint"):
         EpisodeEmbedder(PaintTowers(), encoder)
     with pytest.raises(UserError, match="starts in contact"):
@@ -141,15 +126,12 @@ def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
     touch_alone = {k: v for k, v in recorded().frames.items() if k != FRONT}
     touched = embedder.embed_episode(replace(recorded(), frames=touch_alone), 20.0, "mine")
     assert touched.modalities == ("tactile", "text") and len(touched) == 12
-    other_camera = touch_alone | {WRIST: recorded().frames[FRONT]}
-    with pytest.raises(UserError, match=f"choose --camera {WRIST}"):
-        embedder.embed_episode(replace(recorded(), frames=other_camera), 20.0, "mine")
 
 
 def test_encoders_without_words_measure_touch() -> None:
     """Learned without labels, or an ImageNet network: 0 at the goal, as far untouched as can be."""
     torch.manual_seed(0)
-    goal = choose([OwnFrame()], ("image", "tactile"))
+    goal = assign_goals([OwnFrame()], ("image", "tactile"))
     for encoder in (
         TouchBackbone(TouchBackboneConfig.for_sensor(PRESETS["tiny"], "gelsight_mini")),
         PooledEncoder(PooledEncoderConfig.for_sensor("gelsight_mini")),

@@ -102,19 +102,11 @@ def test_a_sentence_is_a_goal_for_pictures_with_towers_that_know_words() -> None
     [
         (lambda: reward_curve(), "nothing to measure"),
         (lambda: reward_curve(IMAGES / 255), "images must be RGB .* not of float64"),
-        (lambda: reward_curve(IMAGES[0]), "images must be RGB"),
         (lambda: reward_curve(IMAGES[:1]), "at least 2 frames"),
-        (lambda: reward_curve(IMAGES, {"thumb": IMAGES}), "tactile has no 'thumb'"),
         (lambda: reward_curve(IMAGES, {"left": IMAGES[:3]}), "images 12, left 3"),
         (lambda: reward_curve(IMAGES, goal=-1), "goal -1 is not a frame"),
-        (lambda: reward_curve(IMAGES, goal="frame:99"), "frames are 0 to 11"),
-        (lambda: reward_curve(IMAGES, goal=IMAGES), "the goal must be RGB"),
         (lambda: reward_curve(IMAGES, goal={"left": IMAGES[0]}), "must be the trajectory's"),
         (lambda: reward_curve(IMAGES, TOUCH, encoder="nobody"), "no touch encoder 'nobody'"),
-        (
-            lambda: reward_curve(IMAGES, normalizer="none.json"),
-            "there is no normalizer at none.json",
-        ),
     ],
 )
 def test_a_mistake_is_one_line(call: Callable[[], Any], message: str) -> None:
@@ -148,7 +140,6 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for i in range(2):
         write_video(folder / f"{i}.mp4", _stripes(i), 20)
     write_video(folder / "one.mp4", IMAGES[:1], 20)
-    (folder / "goal.png").write_text("no picture")
     Image.new("RGB", (1, 1)).save(folder / "tiny.png")
     return folder
 
@@ -158,19 +149,15 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         (["0.mp4", "--goal", "text:soft"], "knows no words: give --towers"),
         (["0.mp4", "--goal", "frame:12"], "whose frames are 0 to 11"),
-        (["0.mp4", "--goal", "image:goal.png"], "goal.png cannot be read"),
         (["0.mp4", "--goal", "image:tiny.png"], "is 1 x 1 pixels: give one as the camera takes"),
         (["0.mp4", "--fps", "10"], "states its own frame rate: leave --fps out"),
         (["0.mp4", "--device", "warp"], "--device warp cannot be used here"),
         (["episodes", "--index", "0", "0"], "names episode 0 2 times"),
         (["0.mp4", "--goal", "episode:episodes#3"], "has episodes 0 to 2"),
         (["0.mp4", "--goal", "last", "--goal", "frame:1"], "is never used"),
-        (["0.mp4", "--index", "0"], "is not a set of episodes: leave --index out"),
         (["0.mp4", "--encoder", "gelsight_mini"], "has no touch: leave the encoder out"),
-        (["0.mp4", "--gamma", "1.5"], "gamma"),
         (["one.mp4"], "has one frame: a curve needs at least 2"),
         (["episodes", "--camera", "wrist"], "choose --camera observation.images.front"),
-        (["episodes", "--camera", "top"], "has no images of observation.images.top: choose"),
     ],
 )
 def test_mistakes_are_found_before_any_encoder_is_loaded(
@@ -220,18 +207,14 @@ def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
         assert "raw cosine distances, for" in capsys.readouterr().out
     raw = json.loads(Path("raw-0.mp4/0.json").read_text())
     assert raw["unit"] == "cosine distance to goal" and min(raw["cost"]["values"]["image"]) >= 0
-    assert set(json.loads(Path("raw-episodes/episode_000.json").read_text())["metrics"]) == {
-        "image",
-        "tactile",
-    }
+    of_episodes = json.loads(Path("raw-episodes/episode_000.json").read_text())
+    assert set(of_episodes["metrics"]) == {"image", "tactile"}
 
     main(["fit-normalizer", "episodes", "--modalities", "tactile", "--out", "touch"])
     fitted = DistanceNormalizer.load(Path("touch/normalizer.json"))
     assert fitted.episodes == 2 and fitted.scene == "recorded, not simulated"
-    assert fitted.source.sensor == "gelsight_mini" and set(fitted.start) == {
-        "tactile",
-        "tactile (same episode)",
-    }
+    assert fitted.source.sensor == "gelsight_mini"
+    assert set(fitted.start) == {"tactile", "tactile (same episode)"}
     with pytest.raises(SystemExit, match="does not apply here: it has no 'image .same episode.'"):
         main(["reward-curves", "episodes", "--goal", "last", "--normalizer",
               "touch/normalizer.json", "--out", "x"])  # fmt: skip
@@ -267,8 +250,6 @@ def test_python_and_command_agree_on_simulated_episodes(
 
 def test_fit_normalizer_wants_successes(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(run_folder)
-    with pytest.raises(SystemExit, match="give one set of episodes, or several videos"):
-        main(["fit-normalizer", "--out", "y"])
     with pytest.raises(SystemExit, match="at least two successful videos"):
         main(["fit-normalizer", "0.mp4", "--out", "y"])
     with pytest.raises(SystemExit, match="one set of episodes, or several videos"):
@@ -278,13 +259,6 @@ def test_fit_normalizer_wants_successes(run_folder: Path, monkeypatch: pytest.Mo
         EpisodeWriter(Path("unknown")).append(replace(EPISODE, meta=meta))
     with pytest.raises(SystemExit, match="2 of 2 episodes of unknown have no recorded outcome"):
         main(["fit-normalizer", "unknown", "--out", "y"])
-
-
-def test_goal_picture_from_a_file(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(run_folder)
-    Image.fromarray(IMAGES[9]).save("end.png")
-    curves = reward_curve(IMAGES, goal="image:end.png", towers=PaintTowers())
-    assert curves.costs["image"].argmin() == 9
 
 
 def test_cost_during_a_run_is_raw_where_no_normalizer_applies(
@@ -324,10 +298,8 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_p
     goal = embedder.embed_goal(assign_goals(goals, recording.modalities), recording)
     expected = compute_curves(recording, goal, normalizer).parts["fused"]
     assert np.ptp(expected) > 0.05
-    meter, ticks = (
-        CostMeter(model_of(encoder, normalizer, *goals)),
-        [{key: values[i] for key, values in frames.items()} for i in range(len(IMAGES))],
-    )
+    meter = CostMeter(model_of(encoder, normalizer, *goals))
+    ticks = [{key: values[i] for key, values in frames.items()} for i in range(len(IMAGES))]
     during = [meter.measure(tick, ticks[: min(i + 1, 5)]) for i, tick in enumerate(ticks)]
     np.testing.assert_allclose(during[4:], expected[4:], atol=1e-6)
     assert np.abs(during[0] - expected[0]) > 1e-4  # one frame is another background
@@ -341,9 +313,4 @@ def test_a_cell_chooses_the_encoder_of_its_rewards(tmp_path: Path) -> None:
     words = f'rewards = ["text:a hard ball"]\nencoder = "{tmp_path / "plain"}"'
     cell.write_text(text.replace("[task]", f"[task]\n{words}"))
     with pytest.raises(UserError, match="was not aligned with texts"):
-        load_cell_cost(read_cell_file(cell))
-    cell.write_text(
-        text.replace("[task]", f"[task]\n{words}".replace(str(tmp_path / "plain"), "x"))
-    )
-    with pytest.raises(UserError, match="there is no touch encoder 'x'"):
         load_cell_cost(read_cell_file(cell))
