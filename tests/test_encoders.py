@@ -18,22 +18,18 @@ from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric_info_nce
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
-from touchgoal.encoders.backbones.vit import PRESETS, ViT, ViTConfig, random_masking
+from touchgoal.encoders.backbones.vit import PRESETS, ViT, random_masking
 from touchgoal.encoders.preprocess import PREPROCESSORS, check_images
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import portable
 
+ROOT = Path(__file__).parents[1]
 MINI = PREPROCESSORS["gelsight_mini"]
 
 
 @pytest.fixture(autouse=True)
 def seeded() -> None:
     torch.manual_seed(0)
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(0)
 
 
 def make_encoder() -> TouchEncoder:
@@ -52,7 +48,8 @@ def test_preprocessor_is_named_after_the_sensor() -> None:
     assert MINI.id == "gelsight_mini/v1"
 
 
-def test_untouched_is_zero_and_change_is_in_units_of_the_scale(rng: np.random.Generator) -> None:
+def test_untouched_is_zero_and_change_is_in_units_of_the_scale() -> None:
+    rng = np.random.default_rng(0)
     background = rng.integers(50, 200, (240, 320, 3)).astype(np.uint8)
     pressed = background.copy()
     pressed[:80, :, 1] += 16
@@ -64,19 +61,14 @@ def test_untouched_is_zero_and_change_is_in_units_of_the_scale(rng: np.random.Ge
     np.testing.assert_allclose(out[1], expected, atol=1e-6)
 
 
-def test_pixels_are_averaged_over_their_area(rng: np.random.Generator) -> None:
+def test_pixels_are_averaged_over_their_area() -> None:
+    rng = np.random.default_rng(0)
     frame = rng.integers(0, 256, (1, 240, 320, 3)).astype(np.uint8)
     background = np.full((240, 320, 3), 100, np.uint8)
     out = MINI(frame, background)
     steady = remove_gain(frame[0], background)
     blocks = steady.reshape(120, 2, 160, 2, 3).mean((1, 3)).transpose(2, 0, 1)
     np.testing.assert_allclose(out[0] * MINI.scale + 100, blocks, atol=1e-3)
-
-
-def test_another_shape_of_picture_is_refused() -> None:
-    upright = np.zeros((1, 320, 240, 3), np.uint8)
-    with pytest.raises(UserError, match="240x320"):
-        MINI(upright, upright[0])
 
 
 # ---- ViT
@@ -104,18 +96,12 @@ def test_kept_patches_are_all_that_is_seen() -> None:
     assert not torch.allclose(vit(changed, ids_keep), vit(images, ids_keep))
 
 
-def test_random_masking_are_distinct_and_seeded() -> None:
-    drawn = [
-        random_masking(PRESETS["tiny"], 0.5, 50, torch.Generator().manual_seed(1)) for _ in range(2)
-    ]
-    assert drawn[0].shape == (50, 6) and torch.equal(drawn[0], drawn[1])
-    assert all(len(set(row)) == 6 for row in drawn[0].tolist())
-    assert set(drawn[0].flatten().tolist()) == set(range(12))
-
-
-def test_impossible_width_is_refused() -> None:
-    with pytest.raises(UserError, match="divisible"):
-        ViTConfig(width=100, heads=3)
+def test_random_masks_are_distinct_and_seeded() -> None:
+    seeds = (torch.Generator().manual_seed(1) for _ in range(2))
+    one, again = (random_masking(PRESETS["tiny"], 0.5, 50, seed) for seed in seeds)
+    assert one.shape == (50, 6) and torch.equal(one, again)
+    assert all(len(set(row)) == 6 for row in one.tolist())
+    assert set(one.flatten().tolist()) == set(range(12))
 
 
 # ---- InfoNCE
@@ -170,7 +156,8 @@ def test_floor_is_where_free_anchors_end(grouped: bool) -> None:
 # ---- touch encoder
 
 
-def test_embeddings_are_unit_vectors_of_one_space(rng: np.random.Generator) -> None:
+def test_embeddings_are_unit_vectors_of_one_space() -> None:
+    rng = np.random.default_rng(0)
     encoder, towers = make_encoder(), PaintTowers()
     frames = rng.integers(0, 256, (70, 60, 80, 3)).astype(np.uint8)
     touch = encoder.embed_frames(frames, frames[0])
@@ -180,11 +167,6 @@ def test_embeddings_are_unit_vectors_of_one_space(rng: np.random.Generator) -> N
         assert rows.shape[1] == 16
     one = encoder.embed_frames(frames[69:], frames[0])
     np.testing.assert_allclose(one[0], touch[69], atol=1e-5)
-
-
-def test_other_towers_are_refused() -> None:
-    with pytest.raises(UserError, match="trained with the towers paint, not other"):
-        make_encoder().embed_text_goal(["soft"], PaintTowers("other"))
 
 
 # ---- files
@@ -198,15 +180,13 @@ def test_saved_encoder_is_the_same(tmp_path: Path) -> None:
     assert torch.equal(full.embed_touch(touch), encoder.embed_touch(touch))
     assert full.config == encoder.config and not full.training
     assert pretrained.ENCODER_FORMAT.provenance(tmp_path / "full") == {"seed": 3}
+    with pytest.raises(UserError, match="is for gelsight_mini, not digit"):
+        pretrained.load_encoder(tmp_path / "full", sensor="digit")
 
     pretrained.save(encoder, tmp_path / "half", {})
     half = pretrained.load_encoder(tmp_path / "half")
     cosine = (half.embed_touch(touch) * encoder.embed_touch(touch)).sum(1)
     assert (1 - cosine).max() < 1e-3
-    full_bytes, half_bytes = (
-        (tmp_path / name / "encoder.safetensors").stat().st_size for name in ("full", "half")
-    )
-    assert half_bytes < 0.6 * full_bytes
 
 
 def edit_json(directory: Path, change: Callable[[dict], object]) -> None:
@@ -216,14 +196,9 @@ def edit_json(directory: Path, change: Callable[[dict], object]) -> None:
     path.write_text(json.dumps(description))
 
 
-def wrong_shape(directory: Path) -> None:
+def wrong_weights(directory: Path) -> None:
     weights = load_file(directory / "encoder.safetensors")
     weights["touch_head.weight"] = torch.zeros(16, 31)
-    save_file(weights, directory / "encoder.safetensors")
-
-
-def missing_tensor(directory: Path) -> None:
-    weights = load_file(directory / "encoder.safetensors")
     del weights["text_head.weight"]
     save_file(weights, directory / "encoder.safetensors")
 
@@ -241,19 +216,16 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda d: edit_json(d, lambda j: j["config"].update(preprocessor="gelsight_mini/v0")),
         "gelsight_mini/v0, this version has gelsight_mini/v1",
     ),
-    "unknown sensor": (
-        lambda d: edit_json(d, lambda j: j["config"].update(sensor="nose")),
-        "unknown sensor 'nose'",
-    ),
     "no such field": (
         lambda d: edit_json(d, lambda j: j["config"].update(colour="red")),
         "damaged.*colour",
     ),
-    "no kind": (lambda d: edit_json(d, lambda j: j["config"].pop("kind")), "damaged.*kind"),
     "unknown kind": (lambda d: edit_json(d, lambda j: j["config"].update(kind="x")), "damaged.*x"),
     "future format": (lambda d: edit_json(d, lambda j: j.update(format=99)), "format 99"),
-    "wrong shape": (wrong_shape, r"touch_head.weight is \(16, 31\), not \(16, 32\)"),
-    "missing tensor": (missing_tensor, "text_head.weight is None"),
+    "wrong weights": (
+        wrong_weights,
+        r"text_head.weight is None|touch_head.weight is \(16, 31\), not \(16, 32\)",
+    ),
     "cut short": (cut_short, "damaged"),
 }
 
@@ -268,20 +240,12 @@ def test_damaged_files_are_refused(tmp_path: Path, damage: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_encoder_for_another_use_is_refused(tmp_path: Path) -> None:
-    pretrained.save(make_encoder(), tmp_path, {})
-    with pytest.raises(UserError, match="is for gelsight_mini, not digit"):
-        pretrained.load_encoder(tmp_path, sensor="digit")
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         (lambda x: x / 255, r"not of float64: values of 0 to 1 become"),
-        (lambda x: x.astype(np.int64), "not of int64"),
         (lambda x: np.moveaxis(x, -1, -3), "put the colours last"),
         (lambda x: x[..., 0], r"not of shape \(3, 240, 320\)"),
-        (lambda x: x[0, 0], r"not of shape \(320, 3\)"),
         (lambda x: x[:0], "at least one"),
         (lambda x: x[:, :, :120], "1.33 times as wide as high"),
         (lambda x: x[0], "one image needs its background"),
@@ -294,8 +258,6 @@ def test_embed_refuses_what_is_no_picture(wrong: Callable, message: str) -> None
     assert "\n" not in str(error.value)
     with pytest.raises(UserError, match=r"not a torch.Tensor: tensor.cpu\(\).numpy\(\)"):
         check_images("images", torch.from_numpy(images), ndim=(3, 4))
-    with pytest.raises(UserError, match=r"not a builtins\.list"):
-        check_images("images", list(images), ndim=(3, 4))
 
 
 def test_embed_takes_one_picture_or_many() -> None:
@@ -305,22 +267,15 @@ def test_embed_takes_one_picture_or_many() -> None:
     assert many == pytest.approx(encoder.embed_frames(images, images[0]))
     one = encoder.embed(images[1], background=images[0])
     assert one.shape == many[1].shape and one == pytest.approx(many[1], abs=1e-5)
-    with pytest.raises(UserError, match="the background is 160x120 pixels, the images are 320x240"):
-        encoder.embed(images, background=images[0, ::2, ::2])
 
 
-def test_encoders_are_found_by_name_or_path(tmp_path: Path) -> None:
+def test_encoders_are_found_by_name_or_path() -> None:
     shipped = pretrained.load_encoder("gelsight_mini")
     assert shipped.config.sensor == "gelsight_mini"
     assert pretrained.find_encoder("gelsight_mini") == pretrained.DEFAULT_ENCODER
     assert pretrained.find_encoder(pretrained.DEFAULT_ENCODER) == pretrained.DEFAULT_ENCODER
-    with pytest.raises(
-        UserError,
-        match="there is no touch encoder 'gelsigt': .*gelsight_mini, gelsight_mini_markers",
-    ):
+    with pytest.raises(UserError, match="there is no touch encoder 'gelsigt': .*gelsight_mini"):
         pretrained.load_encoder("gelsigt")
-    with pytest.raises(UserError, match="no touch encoder in"):
-        pretrained.load_encoder(tmp_path)
 
 
 def test_no_file_of_weights_names_a_folder_of_this_machine(tmp_path: Path) -> None:
@@ -333,6 +288,8 @@ def test_no_file_of_weights_names_a_folder_of_this_machine(tmp_path: Path) -> No
         "command": "touchgoal train-encoder mae --data b --out=runs/x",
         "data": [{"path": "set", "checksum": "a/b"}],
     }
-    for name in pretrained.encoder_names():
-        record = json.loads((pretrained.find_encoder(name) / "encoder.json").read_text())
+    shipped = [p for f in ("encoders", "policies") for p in (ROOT / f / "weights").rglob("*.json")]
+    assert len(shipped) > 8
+    for path in shipped:
+        record = json.loads(path.read_text())
         assert portable(record) == record

@@ -1,5 +1,6 @@
 """I-JEPA and V-JEPA: what is seen and asked for, the loss by hand, learning, resumption."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,9 @@ import numpy as np
 import pytest
 import torch
 from interrupted_training import killed_in_epoch
+from test_mae import TOY as MAE
+from test_mae import blobs
+from test_self_distillation import TOY as DINO
 from toy_touches import moving_blobs
 
 from touchgoal.encoders import pretrained
@@ -15,6 +19,7 @@ from touchgoal.encoders.ssl.config import (
     IJEPA_PRESETS,
     VJEPA_PRESETS,
     IJepaConfig,
+    MaeConfig,
     PredictorConfig,
     VJepaConfig,
 )
@@ -23,14 +28,15 @@ from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, Predictor
 from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.ssl.vjepa import VJepa
 from touchgoal.encoders.training.options import TrainerOptions
+from touchgoal.runtime.errors import UserError
 
 SMALL: dict[str, Any] = {"epochs": 3, "batch_size": 12, "momentum": 0.9}
 PREDICTOR: dict[str, Any] = {"predictor_width": 24, "predictor_depth": 1, "predictor_heads": 2}
 ITOY = IJepaConfig(vit="tiny", **SMALL, **PREDICTOR)
 VTOY = VJepaConfig(vit="tiny", small_blocks=3, **SMALL, **PREDICTOR)
 CASES: dict[Any, Any] = {
-    "ijepa": (IJepa, train_unlabelled, ITOY, moving_blobs(24)),
-    "vjepa": (VJepa, train_unlabelled, VTOY, moving_blobs(24, frames=4)),
+    "ijepa": (IJepa, ITOY, moving_blobs(24)),
+    "vjepa": (VJepa, VTOY, moving_blobs(24, frames=4)),
 }
 
 
@@ -39,7 +45,7 @@ def rng(seed: int = 0) -> torch.Generator:
 
 
 def build(method: Method, vit: str = "tiny") -> JointEmbeddingPrediction:
-    kind, _, config, data = CASES[method]
+    kind, config, data = CASES[method]
     torch.manual_seed(0)
     return kind(config, backbone_for(method, vit, data.sensor, data.stride), 10)
 
@@ -75,7 +81,7 @@ def test_vjepa_hides_tubes() -> None:
 
 def test_the_loss_of_ijepa_is_the_smooth_distance_of_normed_tokens() -> None:
     model = build("ijepa")
-    touch, drawn = CASES["ijepa"][3].touch[:3], model.draw(3, rng())
+    touch, drawn = CASES["ijepa"][2].touch[:3], model.draw(3, rng())
     total, count = 0.0, 0
     with torch.no_grad():
         for b in range(3):
@@ -94,7 +100,7 @@ def test_the_loss_of_ijepa_is_the_smooth_distance_of_normed_tokens() -> None:
 
 def test_the_loss_of_vjepa_is_the_distance_of_normed_tokens() -> None:
     model = build("vjepa")
-    touch, drawn = CASES["vjepa"][3].touch[:2], model.draw(2, rng())
+    touch, drawn = CASES["vjepa"][2].touch[:2], model.draw(2, rng())
     clip = touch.float().transpose(1, 2)  # channels before frames, the newest first
     losses = []
     with torch.no_grad():
@@ -112,15 +118,14 @@ def test_the_loss_of_vjepa_is_the_distance_of_normed_tokens() -> None:
 @pytest.mark.parametrize("method", CASES)
 def test_what_is_hidden_reaches_the_targets_alone(method: Method) -> None:
     model = build(method)
-    touch, drawn = CASES[method][3].touch[:2].clone(), model.draw(2, rng())
+    touch, drawn = CASES[method][2].touch[:2].clone(), model.draw(2, rng())
     model(touch=touch, **drawn)["loss"].backward()
     assert all(p.grad is None for p in model.teacher.parameters())
     assert all(p.grad is not None for p in model.backbone.parameters())
     context_ids, wanted = (x[0] if isinstance(x, list) else x for x in drawn.values())
     with torch.no_grad():
-        before = model.predict(
-            model.backbone.vit.embed_patches(model.stacked(touch)), context_ids, wanted
-        )
+        patches = model.backbone.vit.embed_patches(model.stacked(touch))
+        before = model.predict(patches, context_ids, wanted)
         for b in range(2):
             for patch in set(range(12)) - set((context_ids[b] % 12).tolist()):
                 y, x = 40 * (patch // 4), 40 * (patch % 4)
@@ -141,32 +146,45 @@ def test_the_predictor_is_told_where() -> None:
     assert not torch.allclose(here, moved, atol=1e-4)
 
 
-@pytest.mark.parametrize("method", CASES)
-def test_a_killed_training_ends_with_the_same_weights(method: Method, tmp_path: Path) -> None:
-    _, train, config, data = CASES[method]
-    whole = train(data, data, config, tmp_path / "whole", TrainerOptions(), {})
+@pytest.mark.parametrize(
+    "config",
+    [MAE, replace(MAE, bottleneck=False), replace(MAE, stacked=True), DINO, ITOY, VTOY],
+    ids=["mae", "mae without bottleneck", "mae of two frames", "dino", "ijepa", "vjepa"],
+)
+def test_a_killed_training_ends_with_the_same_weights(config: Any, tmp_path: Path) -> None:
+    single = isinstance(config, MaeConfig) and not config.stacked
+    data, other = (
+        blobs(24, seed) if single else moving_blobs(24, seed, 4 if config is VTOY else 2)
+        for seed in (0, 1)
+    )
+    whole = train_unlabelled(data, data, config, tmp_path / "whole", TrainerOptions(), {})
     with killed_in_epoch(2):
-        train(data, data, config, tmp_path / "killed", TrainerOptions(), {})
-    train(data, data, config, tmp_path / "killed", TrainerOptions(resume=True), {})
-    resumed = pretrained.load_encoder(tmp_path / "killed/encoder")
+        train_unlabelled(data, data, config, tmp_path / "killed", TrainerOptions(), {})
+    go_on = TrainerOptions(resume=True)
+    with pytest.raises(UserError, match=r"of another data set.*\(data was"):
+        train_unlabelled(other, data, config, tmp_path / "killed", go_on, {})
+    resumed = train_unlabelled(data, data, config, tmp_path / "killed", go_on, {})
     for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
     lines = [(tmp_path / run / "metrics.jsonl").read_text() for run in ("whole", "killed")]
     assert lines[0] == lines[1]
-    assert resumed.offsets == ((0, 2) if method == "ijepa" else (0, 2, 4, 6))
+
+
+@pytest.mark.parametrize(
+    ("config", "offsets"),
+    [(DINO, [0, 2]), (ITOY, [0, 2]), (VTOY, [0, 2, 4, 6])],
+    ids=["dino", "ijepa", "vjepa"],
+)
+def test_a_saved_encoder_sees_its_past_alone(
+    config: Any, offsets: list[int], tmp_path: Path
+) -> None:
+    data = moving_blobs(24, frames=len(offsets))
+    train_unlabelled(data, data, replace(config, epochs=1), tmp_path, TrainerOptions(), {})
+    encoder = pretrained.load_encoder(tmp_path / "encoder")
     frames = np.full((8, 240, 320, 3), 100, np.uint8)
     frames[1, 60:120, 80:160] = 160
-    rows = resumed.embed(frames)
-    past = [1, 3] if method == "ijepa" else [1, 3, 5, 7]
-    assert [not np.allclose(row, rows[0]) for row in rows] == [i in past for i in range(8)]
-
-
-def test_paper_presets_are_table_2() -> None:
-    for paper in (IJEPA_PRESETS["paper"], VJEPA_PRESETS["paper"]):
-        assert (paper.lr, paper.batch_size, paper.epochs) == (6.25e-4, 150, 150)
-        assert (paper.weight_decay, paper.final_weight_decay) == (0.04, 0.4)
-        assert (paper.momentum, paper.final_momentum) == (0.996, 1.0)
-        assert paper.warmup * paper.epochs == 30
+    rows = encoder.embed(frames)
+    assert [not np.allclose(row, rows[0]) for row in rows] == [i - 1 in offsets for i in range(8)]
 
 
 @pytest.mark.parametrize(

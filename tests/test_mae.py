@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from interrupted_training import killed_in_epoch
 from toy_touches import SENSOR, moving_blobs
 
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.vit import patchify, random_masking
 from touchgoal.encoders.probes.ridge import ridge_r2
-from touchgoal.encoders.ssl.config import MAE_PRESETS, MaeConfig
+from touchgoal.encoders.ssl.config import MaeConfig
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.mae import MaskedAutoencoder
 from touchgoal.encoders.ssl.train import train_unlabelled
@@ -37,34 +36,6 @@ def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> N
     assert min(metrics[f"force_{axis}_r2"] for axis in "xyz") > 0.8
     frames = np.full((2, 120, 160, 3), 100, np.uint8)
     assert np.allclose(*backbone.embed_frames(frames, frames[0]))  # the same touch, twice
-
-
-def test_the_paper_preset_is_table_2() -> None:
-    paper = MAE_PRESETS["paper"]
-    assert (paper.lr, paper.batch_size, paper.epochs) == (1e-4, 100, 150)
-    assert (paper.weight_decay, paper.final_weight_decay) == (0.04, 0.4)
-    assert paper.warmup * paper.epochs == 30 and not paper.bottleneck
-
-
-@pytest.mark.parametrize("options", [{}, {"bottleneck": False}, {"stacked": True}])
-def test_a_killed_training_ends_with_the_same_weights(tmp_path: Path, options: dict) -> None:
-    config = replace(TOY, **options)
-    touches = moving_blobs if config.stacked else blobs
-    data = touches(32, 0)
-    whole = train_unlabelled(data, data, config, tmp_path / "whole", TrainerOptions(), {})
-    with killed_in_epoch(2):
-        train_unlabelled(data, data, config, tmp_path / "killed", TrainerOptions(), {})
-    go_on = TrainerOptions(resume=True)
-    resumed = train_unlabelled(data, data, config, tmp_path / "killed", go_on, {})
-    assert resumed.offsets == ((0, 2) if config.stacked else (0,))
-    for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
-        assert torch.equal(a, b)
-    with pytest.raises(UserError, match="holds a run already"):
-        train_unlabelled(data, data, config, tmp_path / "killed", TrainerOptions(), {})
-    with pytest.raises(UserError, match=r"of another data set.*mae.lr was 0.003, is 0.001"):
-        train_unlabelled(data, data, replace(config, lr=1e-3), tmp_path / "killed", go_on, {})
-    with pytest.raises(UserError, match=r"of another data set.*\(data was"):
-        train_unlabelled(touches(32, 1), data, config, tmp_path / "killed", go_on, {})
 
 
 def test_one_visible_patch_is_enough(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Samplers against closed forms and against diffusers; the U-Net against the published one."""
 
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ from touchgoal.policies.heads.samplers import (
 from touchgoal.policies.heads.unet import PRESETS, ShortConv1d, UNet
 from touchgoal.runtime.errors import UserError
 
-MEAN, DEVIATION = 0.4, 0.3  # of the Gaussian that the exact denoisers know
+MEAN, DEVIATION = 0.4, 0.3  # of the Gaussian that the exact flow knows
 
 
 def test_unet_is_the_published_one() -> None:
@@ -41,46 +41,31 @@ def test_short_convolution_is_a_convolution(ticks: int) -> None:
     torch.testing.assert_close(conv(x), expected)
 
 
-def exact(config: SamplerConfig):
-    """Return the exact denoiser for samples of one Gaussian."""
+def exact_flow(x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+    """Return the velocity that takes noise to samples of one Gaussian."""
+    t = step[0] / FLOW_TIME_SCALE
+    gain = (t * DEVIATION**2 - (1 - t)) / (t**2 * DEVIATION**2 + (1 - t) ** 2)
+    return MEAN + gain * (x - t * MEAN)
 
+
+@pytest.mark.parametrize("predicted", ["velocity", "sample"])
+def test_the_exact_flow_gives_the_gaussian_back(predicted: Literal["velocity", "sample"]) -> None:
     def network(x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        if config.kind == "flow":
-            t = step[0] / FLOW_TIME_SCALE
-            gain = (t * DEVIATION**2 - (1 - t)) / (t**2 * DEVIATION**2 + (1 - t) ** 2)
-            velocity = MEAN + gain * (x - t * MEAN)
-            return velocity if config.prediction_type == "velocity" else x + (1 - t) * velocity
-        power = alphas_cumprod(config.num_train_timesteps)[int(step[0])].float()
-        gain = DEVIATION**2 * power.sqrt() / (DEVIATION**2 * power + 1 - power)
-        clean = MEAN + gain * (x - power.sqrt() * MEAN)
-        if config.prediction_type == "sample":
-            return clean
-        return (x - power.sqrt() * clean) / (1 - power).sqrt()
+        velocity = exact_flow(x, step)
+        return (
+            velocity if predicted == "velocity" else x + (1 - step[0] / FLOW_TIME_SCALE) * velocity
+        )
 
-    return network
-
-
-@pytest.mark.parametrize(
-    "config",
-    [
-        SamplerConfig("ddim", "sample", 1000, 200, clip=9),
-        SamplerConfig("ddim", "epsilon", 1000, 200, clip=9),
-        SamplerConfig("ddpm", "sample", 1000, 1000, clip=9),
-        SamplerConfig("flow", "velocity", num_inference_steps=200, clip=9),
-        SamplerConfig("flow", "sample", num_inference_steps=200, clip=9),
-    ],
-    ids=lambda c: f"{c.kind}-{c.prediction_type}",
-)
-def test_exact_denoiser_gives_the_gaussian_back(config: SamplerConfig) -> None:
     noise = torch.randn(4000, 4, 1, generator=torch_rng())
-    samples = denoise(config, exact(config), noise, torch_rng(1))
+    config = SamplerConfig("flow", predicted, num_inference_steps=200, clip=9)
+    samples = denoise(config, network, noise, torch_rng(1))
     assert samples.mean().item() == pytest.approx(MEAN, abs=0.01)
     assert samples.std().item() == pytest.approx(DEVIATION, rel=0.03)
 
 
 @pytest.mark.parametrize("predict", ["epsilon", "sample"])
-def test_forward_process_has_the_schedules_statistics(predict: str) -> None:
-    config = SamplerConfig(prediction_type=predict, num_train_timesteps=10)  # pyright: ignore[reportArgumentType]
+def test_forward_process_has_the_schedules_statistics(predict: Any) -> None:
+    config = SamplerConfig(prediction_type=predict, num_train_timesteps=10)
     clean = torch.full((20_000, 2, 1), 0.7)
     noisy, step, target = add_noise(config, clean, BatchNoise(torch_rng()))
     for t, power in enumerate(alphas_cumprod(10).tolist()):
@@ -94,9 +79,8 @@ def test_forward_process_has_the_schedules_statistics(predict: str) -> None:
 
 def test_flow_goes_straight() -> None:
     clean = torch.randn(50, 4, 2, generator=torch_rng())
-    noisy, step, velocity = add_noise(
-        SamplerConfig("flow", "velocity"), clean, BatchNoise(torch_rng(1))
-    )
+    config = SamplerConfig("flow", "velocity")
+    noisy, step, velocity = add_noise(config, clean, BatchNoise(torch_rng(1)))
     left = 1 - step.view(-1, 1, 1) / FLOW_TIME_SCALE
     torch.testing.assert_close(noisy + left * velocity, clean)
 
@@ -110,20 +94,18 @@ def test_plans_start_from_noise_alone() -> None:
         SamplerConfig("ddim", "velocity")
 
 
+@pytest.mark.parametrize("predicted", ["epsilon", "sample"])
 @pytest.mark.parametrize("kind", ["ddpm", "ddim"])
-def test_samplers_equal_diffusers(kind: str) -> None:
+def test_samplers_equal_diffusers(kind: Any, predicted: Any) -> None:
     from diffusers.schedulers.scheduling_ddim import DDIMScheduler  # here: it takes 3 s
     from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
-    options = {
-        "num_train_timesteps": 100,
-        "beta_schedule": "squaredcos_cap_v2",
-        "timestep_spacing": "trailing",
-    }
+    options = {"beta_schedule": "squaredcos_cap_v2", "timestep_spacing": "trailing"}
+    options |= {"num_train_timesteps": 100, "prediction_type": predicted}
     theirs: Any = (DDPMScheduler if kind == "ddpm" else DDIMScheduler)(**options)
     steps = 100 if kind == "ddpm" else 10
     theirs.set_timesteps(steps)
-    config = SamplerConfig(kind, "epsilon", num_inference_steps=steps)  # pyright: ignore[reportArgumentType]
+    config = SamplerConfig(kind, predicted, num_inference_steps=steps)
     x = noise = torch.randn(3, 8, 2, generator=torch_rng())
     generator, more = torch_rng(1), {"use_clipped_model_output": True} if kind == "ddim" else {}
     for t in theirs.timesteps:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,13 @@ from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.sparsh import backbone_for
 from touchgoal.encoders.ssl import train
-from touchgoal.encoders.ssl.config import DINO_PRESETS, DinoConfig
+from touchgoal.encoders.ssl.config import (
+    DINO_PRESETS,
+    IJEPA_PRESETS,
+    MAE_PRESETS,
+    VJEPA_PRESETS,
+    DinoConfig,
+)
 from touchgoal.encoders.ssl.dino import Dino
 from touchgoal.encoders.ssl.frames import sample_frames
 from touchgoal.encoders.ssl.masks import (
@@ -33,16 +40,8 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
 
-TOY = DinoConfig(
-    vit="tiny",
-    epochs=3,
-    batch_size=12,
-    prototypes=32,
-    head_width=16,
-    head_bottleneck=8,
-    local_views=3,
-    momentum=0.9,
-)
+SMALL: dict[str, Any] = {"prototypes": 32, "head_width": 16, "head_bottleneck": 8}
+TOY = DinoConfig(vit="tiny", epochs=3, batch_size=12, local_views=3, momentum=0.9, **SMALL)
 
 
 def rng(seed: int = 0) -> torch.Generator:
@@ -117,9 +116,7 @@ def test_what_is_seen_is_not_asked_for() -> None:
     seen = draw_equal_counts(left, rng(2))
     assert seen.shape == (50, left.sum(1).min())
     assert left.gather(1, seen).all() and (seen.diff(dim=1) > 0).all()
-    with pytest.raises(
-        UserError, match="1 blocks of 3 x 4 patches leave hardly ever 1 of the 3 x 4"
-    ):
+    with pytest.raises(UserError, match="1 blocks of 3 x 4 patches leave hardly ever 1 of the 3 x"):
         draw_targets((3, 4), (3, 4), 2, 1, torch.ones(2, 12, dtype=torch.bool), 1, rng())
 
 
@@ -155,28 +152,19 @@ def test_a_collapsed_training_saves_nothing(
     assert "WARNING: the embeddings have collapsed" in capsys.readouterr().out
 
 
-def test_a_saved_encoder_sees_the_past(tmp_path: Path) -> None:
+def test_force_is_read_from_a_saved_encoder(tmp_path: Path) -> None:
     train, val = moving_blobs(48, 0), moving_blobs(24, 1)
     encoder = train_unlabelled(train, val, TOY, tmp_path, TrainerOptions(), {})
     metrics = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")["metrics"]
     assert metrics["reconstruction"] > 0.3 and metrics["force_z_r2"] > 0.3
-    loaded = pretrained.load_encoder(tmp_path / "encoder")
-    assert loaded.offsets == (0, 2) and loaded.config == encoder.config
-    frames = np.full((4, 240, 320, 3), 100, np.uint8)
-    frames[1, 60:120, 80:160] = 160
-    rows = loaded.embed(frames)
-    assert not np.allclose(rows[3], rows[0])  # untouched now, but not two ticks ago
-    assert np.allclose(rows[2], rows[0])
+    assert pretrained.load_encoder(tmp_path / "encoder").config == encoder.config
 
 
 def test_moments_hold_the_true_past(tmp_path: Path) -> None:
-    writer = EpisodeWriter(tmp_path)
-    pictures = (
-        np.zeros((6, 240, 320, 3), np.uint8)
-        + 16 * np.arange(6, dtype=np.uint8)[:, None, None, None]
-    )
+    greys = 16 * np.arange(6, dtype=np.uint8)[:, None, None, None]
+    pictures = np.broadcast_to(greys, (6, 240, 320, 3)).copy()
     columns = {key: pictures for key in ft.TACTILE} | {ft.ACTION: np.zeros((6, 8), np.float32)}
-    writer.append(Episode(columns, "feel"))
+    EpisodeWriter(tmp_path).append(Episode(columns, "feel"))
     moments = sample_frames(EpisodeSet(tmp_path), SENSOR, 6, 0, (0, 2, 4))
     assert moments.touch.shape == (12, 3, 3, 120, 160) and moments.stride == 2
     ticks = moments.touch[:6, :, 0, 60, 80].round().tolist()  # a grey level of 16 is 1.0
@@ -185,8 +173,19 @@ def test_moments_hold_the_true_past(tmp_path: Path) -> None:
     assert torch.equal(single.touch, moments.touch[:, 0]) and single.stride == 1
 
 
-def test_the_paper_preset_is_table_2() -> None:
-    paper = DINO_PRESETS["paper"]
-    assert (paper.lr, paper.batch_size, paper.epochs, paper.momentum) == (1e-4, 150, 150, 0.998)
+@pytest.mark.parametrize(
+    ("presets", "lr", "batch_size", "momentum"),
+    [
+        (MAE_PRESETS, 1e-4, 100, None),
+        (DINO_PRESETS, 1e-4, 150, 0.998),
+        (IJEPA_PRESETS, 6.25e-4, 150, 0.996),
+        (VJEPA_PRESETS, 6.25e-4, 150, 0.996),
+    ],
+    ids=["mae", "dino", "ijepa", "vjepa"],
+)
+def test_the_paper_presets_are_table_2(presets, lr, batch_size, momentum) -> None:
+    paper = presets["paper"]
+    assert (paper.lr, paper.batch_size, paper.epochs) == (lr, batch_size, 150)
     assert (paper.weight_decay, paper.final_weight_decay) == (0.04, 0.4)
     assert paper.warmup * paper.epochs == 30
+    assert getattr(paper, "momentum", None) == momentum

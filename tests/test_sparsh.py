@@ -53,8 +53,6 @@ def test_clips_of_any_size_become_tubelets_time_by_time() -> None:
     codes = sinusoidal_positions(2, 3, 48, 2).view(2, 2, 3, 3, 16)  # last: time, row, column
     assert torch.equal(codes[1, 0, 0, 0], codes[0, 1, 0, 1])
     assert torch.equal(codes[1, 0, 0, 0], codes[0, 0, 1, 2])
-    with pytest.raises(UserError, match=r"multiple of 2 frames, not \(1, 3, 3, 32, 40\)"):
-        vit(clip[:, :, :3])
 
 
 def test_learned_positions_start_as_the_fixed_ones_and_hold_for_one_size() -> None:
@@ -89,18 +87,19 @@ def save_training(path: Path, weights: dict[str, Tensor], prefix: str, *pickled:
     torch.save(state | {"global_step": 3, "more": list(pickled)}, path)
 
 
+CLIPS = {"channels": 3, "tubelet": 2}
+MAE, DINO, IJEPA = {}, {"registers": 1}, {"layer_scale": False, "stored": 196}
+VJEPA = CLIPS | {"layer_scale": False, "stored": 392}
+
+
 @pytest.mark.parametrize(
     ("options", "prefix", "shape"),
     [
-        ({}, "encoder.", (6, 48, 32)),
-        ({"registers": 1}, "teacher_encoder.backbone.", (6, 48, 32)),
-        ({"layer_scale": False, "stored": 196}, "target_encoder.", (6, 224, 224)),
-        (
-            {"channels": 3, "tubelet": 2, "layer_scale": False, "stored": 392},
-            "target_encoder.backbone.",
-            (3, 4, 224, 224),
-        ),
-        ({"channels": 3, "tubelet": 2, "registers": 1}, "target_encoder.backbone.", (3, 4, 32, 48)),
+        (MAE, "encoder.", (6, 48, 32)),
+        (DINO, "teacher_encoder.backbone.", (6, 48, 32)),
+        (IJEPA, "target_encoder.", (6, 224, 224)),
+        (VJEPA, "target_encoder.backbone.", (3, 4, 224, 224)),
+        (CLIPS | DINO, "target_encoder.backbone.", (3, 4, 32, 48)),
     ],
     ids=["mae", "dino", "ijepa", "vjepa", "vjepa-sinusoidal"],
 )
@@ -138,11 +137,7 @@ def test_a_wrong_file_is_refused_with_the_keys_that_do_not_fit(tmp_path: Path) -
     save_file(wrong, path)
     with pytest.raises(UserError) as refusal:
         load_sparsh(path)
-    for line in (
-        "blocks.1.ls2.gamma is missing",
-        "blocks.1.ls2.beta is unknown",
-        "blocks.0.attn.proj.bias is (3,), not (192,)",
-    ):
+    for line in ("ls2.gamma is missing", "ls2.beta is unknown", "bias is (3,), not (192,)"):
         assert line in str(refusal.value)
     other = published()
     other["pos_embed.frequency_bands"] *= 2
@@ -152,12 +147,8 @@ def test_a_wrong_file_is_refused_with_the_keys_that_do_not_fit(tmp_path: Path) -
     save_file(published(stored=100), path)
     with pytest.raises(UserError, match=r"100, 192\) positions, which fit neither.*224, 224\)"):
         load_sparsh(path)
-    save_file({"conv1.weight": torch.zeros(3)}, path)
-    with pytest.raises(UserError, match=r"no patch_embed.proj.weight in it, but conv1.weight"):
-        load_sparsh(path)
-    for name, content in (("a.safetensors", b"no"), ("a.ckpt", b"no"), ("missing.ckpt", None)):
-        if content:
-            (tmp_path / name).write_bytes(content)
+    (tmp_path / "a.ckpt").write_bytes(b"no")
+    for name in ("a.ckpt", "missing.ckpt"):
         with pytest.raises(UserError, match=name):
             load_sparsh(tmp_path / name)
 
@@ -165,14 +156,10 @@ def test_a_wrong_file_is_refused_with_the_keys_that_do_not_fit(tmp_path: Path) -
 UPRIGHT, SQUARE = (320, 240), (224, 224)
 # What the weights are, the size of their pictures, and how many frames before the newest each one lies.
 METHODS: dict[str, tuple[dict[str, Any], tuple[int, int], tuple[int, ...]]] = {
-    "mae": ({}, UPRIGHT, (0, 5)),
-    "dino": ({"registers": 1}, UPRIGHT, (0, 5)),
-    "ijepa": ({"layer_scale": False, "stored": 196}, SQUARE, (0, 5)),
-    "vjepa": (
-        {"channels": 3, "tubelet": 2, "layer_scale": False, "stored": 392},
-        SQUARE,
-        (0, 2, 4, 6),
-    ),
+    "mae": (MAE, UPRIGHT, (0, 5)),
+    "dino": (DINO, UPRIGHT, (0, 5)),
+    "ijepa": (IJEPA, SQUARE, (0, 5)),
+    "vjepa": (VJEPA, SQUARE, (0, 2, 4, 6)),
 }
 
 
@@ -243,9 +230,8 @@ def test_pictures_of_any_sensor_become_upright_four_by_three(tmp_path: Path) -> 
     assert preprocess(lying, lying[0]).shape == (1, 3, *UPRIGHT)
     np.testing.assert_array_equal(preprocess(lying, lying[0] // 2), preprocess(cut, cut[0] // 2))
     upright = np.ascontiguousarray(np.rot90(cut[0], -1))
-    np.testing.assert_array_equal(
-        preprocess(upright[None], upright // 2), preprocess(cut, cut[0] // 2)
-    )
+    turned = preprocess(upright[None], upright // 2)
+    np.testing.assert_array_equal(turned, preprocess(cut, cut[0] // 2))
 
 
 def test_ids_of_hugging_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -263,9 +249,6 @@ def test_ids_of_hugging_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     (folder / "refs" / "main").write_text(commit)
     save_file(published(), folder / "snapshots" / commit / "mae_vittiny.safetensors")
     assert load_encoder("facebook/sparsh-mae-toy").offsets == (0, 5)
-    save_file(published(), folder / "snapshots" / commit / "mae_vitsmall.safetensors")
-    with pytest.raises(UserError, match=r"mae_vitsmall.safetensors, mae_vittiny.safetensors: give"):
-        load_encoder("facebook/sparsh-mae-toy")
 
 
 def test_real_touch_takes_them(tmp_path: Path) -> None:
