@@ -1,6 +1,5 @@
 """Sets in lerobot's published layout (v3.0), as `LeRobotDataset` writes them: all episodes in one file."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -47,18 +46,9 @@ def write_lerobot_set(root: Path, episodes: list[Frames], fps: int = 15) -> None
         pq.write_table(pa.Table.from_pylist(part), path)
     described = {key: _feature(values) for key, values in episodes[0].items()}
     described["subtask"] = {"dtype": "string", "shape": [1], "names": None}
-    write_json(
-        root / set_files.INFO,
-        {
-            "codebase_version": "v3.0",
-            "fps": fps,
-            "features": described,
-            "total_episodes": len(episodes),
-            "total_frames": int(ends[-1]),
-            "total_tasks": 1,
-        },
-    )
-    assert json.loads((root / set_files.INFO).read_text())
+    totals = {"episodes": len(episodes), "frames": int(ends[-1]), "tasks": 1}
+    info = {"codebase_version": "v3.0", "fps": fps, "features": described}
+    write_json(root / set_files.INFO, info | {f"total_{name}": n for name, n in totals.items()})
 
 
 def _row(i: int, length: int, end: int, videos: list[str], fps: int) -> dict:

@@ -4,6 +4,7 @@ import io
 import json
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,16 +13,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
-from toy_episodes import FPS, PNG_START, assert_holds, flip_byte, make_episode, moving_blob, record
+from toy_episodes import FPS, PNG_START, assert_holds, flip_byte, make_episode, record
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.format import set_files, statistics
+from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import encode
 from touchgoal.episodes.format.repair import repair, validate
 from touchgoal.episodes.media import read_frames, write_video
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
 
@@ -95,15 +95,6 @@ def test_statistics_of_the_set_are_of_all_frames(recorded: Path) -> None:
     assert stats["index"]["max"] == [209]
 
 
-def test_picture_statistics_equal_numpy() -> None:
-    images = moving_blob(5, 16, 24, 0)
-    stats = statistics.image_statistics(images)
-    scaled = images.reshape(-1, 3) / 255
-    for name, q in statistics.QUANTILES.items():
-        np.testing.assert_allclose(np.ravel(stats[name]), np.quantile(scaled, q, axis=0))
-    np.testing.assert_allclose(np.ravel(stats["std"]), scaled.std(axis=0), atol=1e-9)
-
-
 def test_encoded_in_a_worker_and_continued(small: Path) -> None:
     encoded = pickle.loads(pickle.dumps(encode(make_episode(3), FPS)))
     assert EpisodeWriter(small, FPS).append(encoded) == 3
@@ -112,35 +103,21 @@ def test_encoded_in_a_worker_and_continued(small: Path) -> None:
     assert_holds(small, list(range(5)))
 
 
-def without(episode: Episode, key: str) -> Episode:
-    frames = {name: values for name, values in episode.frames.items() if name != key}
-    return Episode(frames, episode.task, episode.meta)
-
-
 def with_frames(key: str, values: np.ndarray) -> Episode:
-    episode = make_episode(9)
-    return Episode({**episode.frames, key: values}, episode.task, episode.meta)
-
-
-def with_meta(**meta: object) -> Episode:
-    episode = make_episode(9)
-    return Episode(episode.frames, episode.task, {**episode.meta, **meta})  # pyright: ignore
+    return Episode({**make_episode(9).frames, key: values}, "lift the 1", make_episode(9).meta)
 
 
 UNFIT = {
-    "state differ": without(make_episode(9), ft.STATE),
     "wrist differ": with_frames(ft.WRIST, np.zeros((7, 32, 64, 3), np.uint8)),
     "even height": with_frames(ft.WRIST, np.zeros((7, 32, 47, 3), np.uint8)),
     "convert it to uint8": with_frames(ft.WRIST, np.zeros((7, 32, 48, 3), np.float32)),
     "no key of touchgoal": with_frames("observation.smell", np.zeros((7, 1), np.float32)),
     "has 6 frames": with_frames(ft.ACTION, np.zeros((6, 8), np.float32)),
-    "not finite at frame 2": with_frames(
-        ft.ACTION, np.where(np.arange(7)[:, None] == 2, np.nan, np.zeros((7, 8))).astype(np.float32)
+    "not finite at frame 0": with_frames(ft.ACTION, np.full((7, 8), np.nan, np.float32)),
+    "meta differs from the set's in seed": replace(
+        make_episode(9), meta={**make_episode(9).meta, "seed": "nine"}
     ),
-    "meta differs from the set's in light": with_meta(light=1.0),
-    "meta differs from the set's in seed": with_meta(seed="nine"),
-    "does not fit in 64 bits": with_meta(seed=2**64),
-    "task is empty": Episode(make_episode(9).frames, " ", make_episode(9).meta),
+    "task is empty": replace(make_episode(9), task=" "),
 }
 
 
@@ -163,16 +140,12 @@ def test_episodes_to_come_are_checked_before_any_work(small: Path) -> None:
             writer.check_fits(shapes | {key: shape}, "pick-place")
 
 
-def test_refusals_say_what_to_do(small: Path, tmp_path: Path) -> None:
+def test_refusals_say_what_to_do(small: Path) -> None:
     episodes = EpisodeSet(small)
     with pytest.raises(UserError, match="episodes 0 to 2, not 3"):
         episodes.read(3)
     with pytest.raises(UserError, match="frames 0 to 6, not -1"):
         episodes.read(0, frames=[0, -1])
-    with pytest.raises(UserError, match="has no observation.images.front"):
-        episodes.read(0, [ft.FRONT])
-    with pytest.raises(UserError, match="not a set of episodes"):
-        EpisodeSet(tmp_path)
     with pytest.raises(UserError, match="20 frames per second, not 30"):
         EpisodeWriter(small, fps=30)
     info = json.loads((small / set_files.INFO).read_text())
@@ -183,12 +156,7 @@ def test_refusals_say_what_to_do(small: Path, tmp_path: Path) -> None:
 
 
 def add_episodes_like_lerobot(root: Path, extend: bool) -> None:
-    """Two more episodes as lerobot lays them out: both in one data file and one video.
-
-    Args:
-        root: a set of three episodes of 7 frames.
-        extend: the last files are extended (lerobot 0.4), else new ones begun (0.6).
-    """
+    """Add two episodes to three of 7 frames as lerobot 0.4 (`extend` the last files) or 0.6 does."""
     extra = root.with_name("extra")
     record(extra, range(3, 5))
     tables = [pq.read_table(extra / set_files.data_path(i)) for i in range(2)]
@@ -199,10 +167,8 @@ def add_episodes_like_lerobot(root: Path, extend: bool) -> None:
         wrist.insert(0, EpisodeSet(root).read(2, [ft.WRIST]).frames[ft.WRIST])
     table = pa.concat_tables([t.replace_schema_metadata(None) for t in tables])
     first = 35 - len(table)
-    for key, values in (
-        ("index", np.arange(first, 35)),
-        ("episode_index", np.arange(first, 35) // 7),
-    ):
+    index = np.arange(first, 35)
+    for key, values in (("index", index), ("episode_index", index // 7)):
         table = table.set_column(table.column_names.index(key), key, pa.array(values))
     pq.write_table(table, root / set_files.data_path(file), compression="snappy")
     write_video(root / set_files.video_path(ft.WRIST, file), np.concatenate(wrist), FPS)
@@ -253,15 +219,6 @@ def test_a_set_that_lerobot_continued_is_left_as_it_is(small: Path, extend: bool
     assert {path: path.read_bytes() for path in small.rglob("*") if path.is_file()} == before
 
 
-def test_a_data_file_without_our_description_is_not_moved(small: Path) -> None:
-    path = small / set_files.data_path(1)
-    pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
-    before = sorted(small.rglob("*"))
-    with pytest.raises(UserError, match="changes nothing here"):
-        repair(small)
-    assert sorted(small.rglob("*")) == before
-
-
 def test_the_run_folder_around_a_set_will_do(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -271,13 +228,6 @@ def test_the_run_folder_around_a_set_will_do(
     assert validate(tmp_path / "run") == []
 
 
-def test_hidden_files_are_no_damage(small: Path) -> None:
-    for name in (".cache/huggingface/lock", "data/.cache/embeddings/a.parquet", "meta/.DS_Store"):
-        write_file(small / name, b"")
-    assert validate(small) == []
-    assert EpisodeWriter(small, FPS).append(make_episode(3)) == 3
-
-
 def test_two_recorders_in_one_folder(tmp_path: Path) -> None:
     """The second is refused before it has done any work; an unused folder goes again."""
     first = EpisodeWriter(tmp_path / "set", FPS)
@@ -285,9 +235,6 @@ def test_two_recorders_in_one_folder(tmp_path: Path) -> None:
         EpisodeWriter(tmp_path / "set", FPS)
     first.close()
     assert not (tmp_path / "set").exists()
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot record into .*give another folder"):
-        EpisodeWriter(tmp_path / "file", FPS)
 
 
 def test_checksum_tells_sets_apart(recorded_small: Path, small: Path) -> None:
@@ -308,9 +255,8 @@ def test_video_and_folder_give_the_same_frames(tmp_path: Path) -> None:
     frames = moving_ramp(12, 32, 48)
     write_video(tmp_path / "clips" / "a.mp4", frames, 12.5)
     read, fps = read_frames(tmp_path / "clips" / "a.mp4")
-    assert (
-        fps == 12.5 and read.shape == frames.shape and np.abs(read - frames.astype(int)).max() < 12
-    )
+    assert fps == 12.5 and read.shape == frames.shape
+    assert np.abs(read - frames.astype(int)).max() < 12
     folder = tmp_path / "pictures"
     folder.mkdir()
     for i, frame in enumerate(frames):
@@ -323,12 +269,10 @@ def test_video_and_folder_give_the_same_frames(tmp_path: Path) -> None:
 def test_unreadable_media(tmp_path: Path) -> None:
     (tmp_path / "broken.mp4").write_bytes(b"\0" * 500)
     (tmp_path / "empty").mkdir()
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "bad" / "0.png").write_bytes(b"no picture")
     (tmp_path / "mixed").mkdir()
     for i in (1, 2):
         cv2.imwrite(str(tmp_path / "mixed" / f"{i}.png"), np.zeros((8 * i, 8, 3), np.uint8))
-    for name in ("broken.mp4", "empty", "bad", "mixed", "absent.mp4"):
+    for name in ("broken.mp4", "empty", "mixed", "absent.mp4"):
         with pytest.raises(UserError, match=name):
             read_frames(tmp_path / name)
     with pytest.raises(UserError, match="even height"):

@@ -45,10 +45,8 @@ def test_every_kind_changes_what_it_says() -> None:
     back = made["rewind"].frames
     assert len(made["rewind"]) == 2 * turn and not touching["rewind"][-1]
     assert np.array_equal(back[FRONT][:turn], back[FRONT][::-1][:turn])
-    firm, soft = (
-        f[TACTILE[1]][-1].astype(float).max() for f in (made["over_press"].frames, own.frames)
-    )
-    assert firm > soft + 30
+    firm, soft = (e.frames[TACTILE[1]][-1].astype(float) for e in (made["over_press"], own))
+    assert firm.max() > soft.max() + 30
     wrong = made["wrong_object"].frames
     assert np.array_equal(wrong[TACTILE[0]], other.frames[TACTILE[0]])
     assert np.array_equal(wrong[FRONT], own.frames[FRONT])
@@ -57,10 +55,9 @@ def test_every_kind_changes_what_it_says() -> None:
 
 
 def test_a_success_that_never_touches_or_at_once_is_refused() -> None:
-    with pytest.raises(UserError, match="after at least 5 frames"):
-        made_failures(success(contact=LENGTH), success(1))
-    with pytest.raises(UserError, match="after at least 5 frames"):
-        made_failures(success(contact=2), success(1))
+    for contact in (2, LENGTH):
+        with pytest.raises(UserError, match="after at least 5 frames"):
+            made_failures(success(contact=contact), success(1))
     blind = Episode({STATE: np.zeros((9, 15), np.float32)}, "place it")
     with pytest.raises(UserError, match="a camera and touch"):
         made_failures(blind, success(1))

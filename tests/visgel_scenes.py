@@ -19,25 +19,14 @@ PLACES = ((70.0, 95.0), (165.0, 45.0), (160.0, 118.0))  # centres of the objects
 
 @dataclass
 class Scene:
-    """One recording with its ground truth.
-
-    Attributes:
-        name: Name of its folder.
-        boxes: True boxes of its objects.
-        colours: Name of each object.
-        touched: Index of the touched object.
-        place: Middle of the sensor at the contact, px.
-        fault: What is wrong with it: "" or "no touch", "missed" (the touched object by the detector),
-            "unsure" (every score is low), "no sensor".
-        detections: What the detector's stand-in answers.
-    """
+    """One recording with its ground truth."""
 
     name: str
     boxes: list[Box]
     colours: list[str]
-    touched: int
-    place: tuple[float, float]
-    fault: str
+    touched: int  # index of a box
+    place: tuple[float, float]  # middle of the sensor at the contact, px
+    fault: str  # "", "no touch", "missed" (by the detector), "unsure" (low scores) or "no sensor"
     detections: list[Detection] = field(default_factory=list)
 
     @property
@@ -86,8 +75,7 @@ def detections_of(scene: Scene, rng: np.random.Generator) -> list[Detection]:
 def sensor_box(scene: Scene, frame: int) -> Box:
     """The sensor goes from the left upper corner to the object and stays there."""
     start, end = np.array([20.0, 20.0]), np.asarray(scene.place)
-    x, y = start + (end - start) * min(max(frame - 1, 0) / 6, 1.0)
-    x, y = float(x), float(y)
+    x, y = (start + (end - start) * min(max(frame - 1, 0) / 6, 1.0)).tolist()
     return (x - SENSOR / 2, y - SENSOR / 2, x + SENSOR / 2, y + SENSOR / 2)
 
 
@@ -183,32 +171,13 @@ def make_detector(folder: Path) -> Path:
 
     words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", ".", "object", "robot", "gripper", "?"]
     BertTokenizer(vocab={word: i for i, word in enumerate(words)}).save_pretrained(folder)
-    small: dict[str, Any] = {
-        "num_hidden_layers": 1,
-        "num_attention_heads": 2,
-        "intermediate_size": 32,
-    }
-    levels: dict[str, Any] = {"out_indices": [2, 3, 4]}  # pyright does not know it
-    config = GroundingDinoConfig(
-        backbone_config=SwinConfig(
-            image_size=64,
-            embed_dim=8,
-            depths=[1, 1, 1, 1],
-            num_heads=[1, 1, 2, 2],
-            window_size=4,
-            **levels,
-        ),
-        text_config=BertConfig(vocab_size=len(words), hidden_size=16, **small),
-        num_queries=6,
-        d_model=32,
-        max_text_len=16,
-        encoder_layers=1,
-        decoder_layers=2,  # one fails
-        encoder_ffn_dim=16,
-        decoder_ffn_dim=16,
-        encoder_attention_heads=2,
-        decoder_attention_heads=2,
-    )
+    small: dict[str, Any] = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
+    swin: dict[str, Any] = {"image_size": 64, "embed_dim": 8, "window_size": 4}
+    swin |= {"depths": [1] * 4, "num_heads": [1, 1, 2, 2], "out_indices": [2, 3, 4]}
+    sizes: dict[str, Any] = {"num_queries": 6, "d_model": 32, "max_text_len": 16}
+    sizes |= {"encoder_layers": 1, "decoder_layers": 2}  # with one layer it fails
+    text = BertConfig(vocab_size=len(words), intermediate_size=32, **small)
+    config = GroundingDinoConfig(backbone_config=SwinConfig(**swin), text_config=text, **sizes)
     torch.manual_seed(0)
     GroundingDinoForObjectDetection(config).save_pretrained(folder)
     size = {"shortest_edge": 128, "longest_edge": 256}  # 64 fails
@@ -233,30 +202,15 @@ def make_captioner(folder: Path) -> Path:
     words = ["<s>", "<pad>", "</s>", "<unk>", "<image>", "What", "specific", "object", "ball", "?"]
     tokenizer = Tokenizer(models.WordLevel({w: i for i, w in enumerate(words)}, unk_token="<unk>"))
     tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+    special = {"bos_token": "<s>", "eos_token": "</s>", "pad_token": "<pad>", "unk_token": "<unk>"}
     PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer,
-        bos_token="<s>",
-        eos_token="</s>",
-        pad_token="<pad>",
-        unk_token="<unk>",
-        additional_special_tokens=["<image>"],
+        tokenizer_object=tokenizer, additional_special_tokens=["<image>"], **special
     ).save_pretrained(folder)
     small: dict[str, Any] = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
     vision = Blip2VisionConfig(intermediate_size=16, image_size=32, patch_size=16, **small)
-    qformer = Blip2QFormerConfig(
-        vocab_size=20,
-        intermediate_size=16,
-        encoder_hidden_size=16,
-        cross_attention_frequency=1,
-        **small,
-    )
-    text = OPTConfig(
-        vocab_size=len(words),
-        ffn_dim=16,
-        max_position_embeddings=64,
-        word_embed_proj_dim=16,
-        **small,
-    )
+    between = {"vocab_size": 20, "intermediate_size": 16, "encoder_hidden_size": 16}
+    qformer = Blip2QFormerConfig(cross_attention_frequency=1, **between, **small)
+    text = OPTConfig(vocab_size=len(words), ffn_dim=16, word_embed_proj_dim=16, **small)
     config = Blip2Config(
         vision_config=vision.to_dict(),
         qformer_config=qformer.to_dict(),
