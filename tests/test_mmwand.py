@@ -30,13 +30,16 @@ from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
 OBJECTS, TOUCHES = 10, 200
 
 
-@pytest.fixture(scope="module")
-def wand(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("wand") / "episodes"
+def press_objects(root: Path, sensor: str, seed: int) -> Path:
     with pytest.MonkeyPatch.context() as patch, in_process_workers():
         patch.setattr(wand_recording, "TOUCHES_A_VISIT", 3)
-        record_touches(root, "gelsight_mini", 0, 18, 1)
+        record_touches(root, sensor, seed, 18, 1)
     return root
+
+
+@pytest.fixture(scope="module")
+def wand(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return press_objects(tmp_path_factory.mktemp("wand") / "episodes", "gelsight_mini", 0)
 
 
 def made_up(seed: int = 0) -> EmbeddedSet:
@@ -65,9 +68,8 @@ def made_up(seed: int = 0) -> EmbeddedSet:
 @pytest.mark.parametrize("split", SPLITS)
 def test_a_split_holds_out_what_it_says(split) -> None:
     data = made_up()
-    fold, again = (
-        split_touches(split, data.label, data.visit, data.describes, seed) for seed in (1, 1)
-    )
+    drawn = data.label, data.visit, data.describes, 1
+    fold, again = split_touches(split, *drawn), split_touches(split, *drawn)
     assert not set(fold.train) & set(fold.test) and (fold.test == again.test).all()
     assert 0.1 < len(fold.test) / TOUCHES < 0.3
     if split == "object":
@@ -97,12 +99,10 @@ def test_retrieval_knows_the_right_answer_and_chance() -> None:
 def test_heads_bring_words_and_pictures_to_touch() -> None:
     data = made_up()
     touch = F.normalize(torch.from_numpy(data.touch["touch"]), dim=1)
+    rows = (torch.from_numpy(x) for x in (data.label, data.image, data.texts, data.describes))
+    label, image, texts, describes = rows
     paired = PairedEmbeddings(
-        touch=touch,
-        label=torch.from_numpy(data.label),
-        image=torch.from_numpy(data.image),
-        texts=torch.from_numpy(data.texts),
-        describes=torch.from_numpy(data.describes),
+        touch=touch, label=label, image=image, texts=texts, describes=describes
     )
     heads = fit_heads(paired, HeadsConfig(epochs=60, batch_size=100), 0)
     again = fit_heads(paired, HeadsConfig(epochs=60, batch_size=100), 0)
@@ -135,11 +135,7 @@ def grasps(root: Path) -> Path:
         frames = np.repeat(gel[None], 12, axis=0)
         frames[6:, *stripe] = 200
         contact = np.repeat(np.arange(12)[:, None] >= 6, 2, axis=1)
-        meta = {
-            "object": name,
-            "descriptions": [f"the feel of a {name}"],
-            "sensor": "gelsight_mini",
-        }
+        meta = {"object": name, "descriptions": [f"a {name}"], "sensor": "gelsight_mini"}
         observed = {ft.TACTILE_LEFT: frames, ft.TRUTH_CONTACT: contact}
         EpisodeWriter(root).append(Episode(observed, "grasp", meta))
     return root
@@ -175,10 +171,8 @@ def test_fewer_candidates_are_hit_more_often() -> None:
 def test_the_benchmarks_run(
     name: str, wand: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = (
-        f"benchmark {name} --data {wand} --cache {wand.parent / 'cache'} --out {tmp_path / 'run'}"
-    )
-    command += " --encoders gelsight_mini --seeds 1"
+    command = f"benchmark {name} --data {wand} --cache {wand.parent / 'cache'}"
+    command += f" --out {tmp_path / 'run'} --encoders gelsight_mini --seeds 1"
     if name == "retrieval":
         command += " --heads.epochs 2 --trained efficientnet --epochs 1"
     assert main([*command.split(), "--splits", "sample", "press"]) in (0, None)
@@ -205,10 +199,7 @@ def test_a_touch_encoder_is_aligned_on_the_wands_touches(wand: Path, tmp_path: P
 def test_touches_of_another_sensor_choose_among_sentences(
     wand: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = tmp_path / "episodes"
-    with pytest.MonkeyPatch.context() as patch, in_process_workers():
-        patch.setattr(wand_recording, "TOUCHES_A_VISIT", 3)
-        record_touches(other, "gelsight", 1, 18, 1)
+    other = press_objects(tmp_path / "episodes", "gelsight", 1)
     command = f"benchmark zero-shot --data {other} --other {wand} --seeds 3 --heads.epochs 2"
     command += f" --cache {wand.parent / 'cache'} --out {tmp_path / 'run'}"
     assert main(command.split()) in (0, None)

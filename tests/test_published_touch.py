@@ -3,7 +3,6 @@
 import io
 import os
 import pickle
-from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -75,8 +74,6 @@ def test_touch_and_go_has_red_and_blue_put_back(tmp_path: Path) -> None:
     assert [r.held_out for r in recordings] == [True, False, False, False]  # the shortest quarter
     assert near(recordings[2].open()[0].frames([4])[0], gel(4, (480, 640)))
     assert read_recordings(tmp_path, "gelsight")[0].sensor == "gelsight"
-    with pytest.raises(UserError, match=r"with gelsight_markers or gelsight, not digit"):
-        read_recordings(tmp_path, "digit")
 
 
 def test_object_folder_is_a_mini(tmp_path: Path) -> None:
@@ -86,7 +83,6 @@ def test_object_folder_is_a_mini(tmp_path: Path) -> None:
     assert [r.sensor for r in recordings] == 3 * ["gelsight_mini"]
     assert [r.held_out for r in recordings] == [False, False, True]
     assert near(recordings[2].open()[0].frames([0])[0], gel(3, (240, 320)))
-    assert read_recordings(tmp_path, "gelsight_mini_markers")
 
 
 def test_touches_are_drawn_with_those_before_them(tmp_path: Path) -> None:
@@ -104,9 +100,7 @@ def test_touches_are_drawn_with_those_before_them(tmp_path: Path) -> None:
     assert np.array_equal(alone.touch[:3], sample_recordings(recordings[:1], 3, 0).touch)
 
 
-def test_an_encoder_learns_from_a_published_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_encoder_learns_from_a_published_folder(tmp_path: Path) -> None:
     data, out = tmp_path / "slides", tmp_path / "run"
     write_slides(data)
     toy = "--frames 4 --mae.vit tiny --mae.epochs 1 --mae.batch-size 8".split()
@@ -115,27 +109,15 @@ def test_an_encoder_learns_from_a_published_folder(
     assert encoder.embed(np.stack([gel(1), gel(2)])).shape[0] == 2  # upright, as a DIGIT's
     recipe = ENCODER_FORMAT.provenance(out / "encoder")
     assert recipe["data"]["train"] == [{"path": data.name, "recordings": 8, "held_out": 2}]
-    for words, message in (
-        (["--data", str(data), "--sensor", "gelsight_mini"], "with digit, not gelsight_mini"),
-        (["--data", str(data), "--validation", str(data)], "leave --validation out"),
-    ):
-        with pytest.raises(SystemExit) as refused:
-            main(["train-encoder", "mae", *words, "--out", str(tmp_path / "other"), *toy])
-        assert message in f"{refused.value.code}{capsys.readouterr().err}"
 
 
 def test_what_is_no_such_folder_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="is no folder"):
-        read_recordings(tmp_path / "none")
     with pytest.raises(UserError, match="none of the published layouts"):
         read_recordings(tmp_path)
     write(tmp_path / "001.pkl", [encoded(gel(1))])
     with pytest.raises(UserError, match="one recording: training and validation"):
         read_recordings(tmp_path)
-    write(tmp_path / "002.pkl", [])
-    with pytest.raises(UserError, match="002.pkl holds no image"):
-        read_recordings(tmp_path)
-    (tmp_path / "002.pkl").write_bytes(pickle.dumps({"gelsightA_before": [b""]}))
+    write(tmp_path / "002.pkl", {"gelsightA_before": [b""]})
     with pytest.raises(UserError, match="is not a list of encoded images"):
         read_recordings(tmp_path)
     write(tmp_path / "002.pkl", [encoded(gel(1)), encoded(gel(1, (240, 240)))])
@@ -183,10 +165,8 @@ def test_a_picture_of_another_kind_or_a_huge_one_is_refused() -> None:
 def test_strokes_have_their_pictures_forces_and_slips(tmp_path: Path) -> None:
     labels = write_force_batch(tmp_path / "sphere" / "batch_1", strokes=2)
     strokes = list(read_strokes(tmp_path))
-    assert [(s.name, s.probe) for s in strokes] == [
-        ("sphere/batch_1/0", "sphere"),
-        ("sphere/batch_1/1", "sphere"),
-    ]
+    assert [s.name for s in strokes] == ["sphere/batch_1/0", "sphere/batch_1/1"]
+    assert {s.probe for s in strokes} == {"sphere"}
     for i, stroke in enumerate(strokes):
         assert stroke.clip.sensor == "digit"
         true = labels[i]["forces"] * (1, 1, -1)  # pressing is positive
@@ -195,7 +175,6 @@ def test_strokes_have_their_pictures_forces_and_slips(tmp_path: Path) -> None:
         assert np.array_equal(stroke.frames()[5], gel(10 * i + 5))  # over the end of the first file
         assert np.array_equal(stroke.background(), np.full((320, 240, 3), UNTOUCHED["red"]))
         assert stroke.untouched == 8 * i + 1  # the last before it
-    assert len(list(read_strokes(tmp_path / "sphere"))) == 2
     assert len(list(read_strokes(tmp_path / "sphere" / "batch_1"))) == 2
 
 
@@ -213,17 +192,14 @@ def test_a_mini_lies_and_a_batch_of_exchanged_colours_is_mended(tmp_path: Path) 
         next(read_strokes(tmp_path, "digit"))
 
 
-def test_a_batch_that_is_not_whole_is_one_line(tmp_path: Path) -> None:
-    batch = tmp_path / "sphere" / "batch_1"
-    with pytest.raises(UserError, match="give a folder of TacBench's force estimation"):
-        next(read_strokes(tmp_path))
-    write_force_batch(batch)
-    (batch / "dataset_digit_01.pkl").unlink()
-    with pytest.raises(UserError, match="10 images, .* labels 16: get all its files"):
-        next(read_strokes(tmp_path))
-    write_force_batch(batch)
-    (batch / "dataset_slip_forces.pkl").unlink()
-    with pytest.raises(UserError, match="dataset_slip_forces.pkl is missing"):
+@pytest.mark.parametrize(
+    ("lost", "message"),
+    [("digit_01", "10 images, .* labels 16: get all its files"), ("slip_forces", "is missing")],
+)
+def test_a_batch_that_is_not_whole_is_one_line(tmp_path: Path, lost: str, message: str) -> None:
+    write_force_batch(tmp_path / "sphere" / "batch_1")
+    (tmp_path / "sphere" / "batch_1" / f"dataset_{lost}.pkl").unlink()
+    with pytest.raises(UserError, match=message):
         next(read_strokes(tmp_path))
 
 
@@ -231,15 +207,8 @@ def test_a_batch_that_is_not_whole_is_one_line(tmp_path: Path) -> None:
     ("change", "message"),
     [
         (lambda v: v.pop("trajectories"), "has no 'trajectories'"),
-        (lambda v: v.update(trajectories={}), "has no stroke"),
         (lambda v: v.update(in_contact=np.ones(16)), "labelled as without contact"),
-        (lambda v: v["trajectories"][0].pop("forces"), "stroke 0 in .* has no 'forces'"),
         (lambda v: v["trajectories"][0].update(forces=np.full((6, 3), np.nan)), "not all between"),
-        (
-            lambda v: v["trajectories"][0].update(forces=np.zeros((6, 2))),
-            r"shape \(6, 2\), not \(n, 3",
-        ),
-        (lambda v: v["trajectories"][0].update(forces=[[1.0], [1.0, 2.0]]), "no plain numbers"),
         (lambda v: v["trajectories"][0].update(indexes=np.arange(3)), "3 images, 6 forces"),
         (lambda v: v["trajectories"][0].update(slip_label=np.full(6, 2)), "from 0 to 1"),
     ],
@@ -260,12 +229,8 @@ def test_wrong_labels_are_one_line(
 def test_bags_have_motions_in_metres_and_radians(tmp_path: Path) -> None:
     write_pose_set(tmp_path)
     bags = list(read_bags(tmp_path))
-    assert [(b.object, b.held_out) for b in bags] == [
-        (name, held_out)
-        for held_out in (False, True)
-        for name in ("pringles", "sugar")
-        for _ in "ab"
-    ]
+    assert [b.object for b in bags] == 2 * (2 * ["pringles"] + 2 * ["sugar"])
+    assert [b.held_out for b in bags] == 4 * [False] + 4 * [True]
     bag = bags[0]
     assert len(bag.clip) == len(bag.change) == 8  # one pose more than pictures
     assert bag.change[6] == pytest.approx([0.6e-3, -1.2e-3, np.radians(0.4)])
@@ -276,25 +241,15 @@ def test_bags_have_motions_in_metres_and_radians(tmp_path: Path) -> None:
     write(path, whole | {"object_ring_rel_pose_n5": 2 * whole["object_ring_rel_pose_n5"]})
     with pytest.raises(UserError, match="no rigid motions"):
         list(read_bags(tmp_path))
-    write(path, {"digit_ring": whole["digit_ring"]})
-    with pytest.raises(UserError, match="bag_00.pkl has no 'object_ring_rel_pose_n5'"):
-        list(read_bags(tmp_path))
-    (tmp_path / "bgs" / "digit_ring.png").unlink()
-    with pytest.raises(UserError, match=r"digit_ring\.png is missing"):
-        next(read_bags(tmp_path))
-    with pytest.raises(UserError, match="give the folder of TacBench's pose estimation"):
-        next(read_bags(tmp_path / "train"))
 
 
 def test_grasps_are_held_or_not_and_felt_by_two_fingers(tmp_path: Path) -> None:
     write_grasps(tmp_path / "029.pkl", [True, False])
     write_grasps(tmp_path / "030.pkl", [False])
     trials = list(read_grasps(tmp_path))
-    assert [(t.object, t.held, t.held_out) for t in trials] == [
-        ("mug", True, False),
-        ("mug", False, False),
-        ("mug", False, True),
-    ]
+    assert {t.object for t in trials} == {"mug"}
+    assert [t.held for t in trials] == [True, False, False]
+    assert [t.held_out for t in trials] == [False, False, True]
     for f, finger in enumerate(trials[1].fingers):
         assert finger.sensor == "gelsight"
         for m, frame in enumerate(finger.frames(range(3))):
@@ -303,37 +258,18 @@ def test_grasps_are_held_or_not_and_felt_by_two_fingers(tmp_path: Path) -> None:
     write(tmp_path / "030.pkl", value | {"is_gripping": [True, False]})
     with pytest.raises(UserError, match="of different lengths"):
         list(read_grasps(tmp_path))
-    write(tmp_path / "030.pkl", value | {"is_gripping": ["yes"]})
-    with pytest.raises(UserError, match="no plain numbers"):
-        list(read_grasps(tmp_path))
-    with pytest.raises(UserError, match="give a folder of Feeling of Success"):
-        next(read_grasps(tmp_path / "none"))
 
 
-def write_force_labels(folder: Path) -> Path:
-    write_force_batch(folder / "sphere" / "batch_1")
-    return folder / "sphere" / "batch_1" / "dataset_slip_forces.pkl"
-
-
-def write_bag(folder: Path) -> Path:
-    write_pose_set(folder, bags=1)
-    return folder / "train" / "sugar" / "bag_00.pkl"
-
-
-def write_grasp_labels(folder: Path) -> Path:
-    write_grasps(folder / "000.pkl", [True, False])
-    return folder / "000.pkl"
-
-
-@pytest.mark.parametrize(
-    ("write_set", "read"),
-    [(write_force_labels, read_strokes), (write_bag, read_bags), (write_grasp_labels, read_grasps)],
-)
-def test_whatever_byte_is_wrong_labels_are_read_or_refused(
-    tmp_path: Path, write_set: Callable, read: Callable
-) -> None:
-    path = write_set(tmp_path)
+@pytest.mark.parametrize("read", [read_strokes, read_bags, read_grasps])
+def test_whatever_byte_is_wrong_labels_are_read_or_refused(tmp_path: Path, read: Callable) -> None:
+    if read is read_strokes:
+        write_force_batch(tmp_path / "sphere" / "batch_1")
+    elif read is read_bags:
+        write_pose_set(tmp_path, bags=1)
+    else:
+        write_grasps(tmp_path / "000.pkl", [True, False])
     assert list(read(tmp_path))
+    path = max(tmp_path.rglob("*.pkl"))  # of force batches the last one holds the labels
     data, rng = path.read_bytes(), np.random.default_rng(2)
     pictures = [at for at in range(len(data)) if data[at : at + 3] == b"\xff\xd8\xff"]
     # Of a file of pictures the bytes about them and at its end count, where the labels are.
@@ -379,11 +315,9 @@ class Hostile:
     ("data", "message"),
     [
         (pickle.dumps(Hostile()), r"asks for posix\.system"),
-        (pickle.dumps(OrderedDict()), r"asks for collections\.OrderedDict"),
         (b"\x80\x03(ios\nsystem\n.", r"asks for os\.system"),
         (b"\x80\x04\x8c\x02o\n\x8c\x06system\x93.", r"asks for o\\n\.system"),
         (b"", "no pickle of plain values"),
-        (pickle.dumps(VALUE)[:-30], "damaged"),
         (pickle.dumps(VALUE) + b"more", "damaged"),
         (b"\x80\x04\x8e" + b"\xff" * 8 + b".", "damaged"),
     ],

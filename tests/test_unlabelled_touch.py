@@ -47,11 +47,8 @@ def write_videos(folder: Path, splits: tuple[str, ...] = SPLITS, brightness: int
         rows = csv.writer(file)
         rows.writerow("file object name split hardness roughness bumpiness".split())
         for split in splits:
-            write_video(
-                folder / "videos" / f"{split}.mp4",
-                press(20 if split in ("val", "test") else brightness),
-                10,
-            )
+            pictures = press(20 if split in ("val", "test") else brightness)
+            write_video(folder / "videos" / f"{split}.mp4", pictures, 10)
             rows.writerow([f"{split}.mp4", split, split, split, "", "", ""])
     return folder
 
@@ -69,8 +66,6 @@ def test_held_out_videos_are_judged_by_and_not_learned_from(tmp_path: Path) -> N
     assert set(pressed_up(train.touch)) == {0, 1} and set(pressed_up(judged.touch)) == {0, -1}
     moments = touch.train(9, 0, (0, 2))
     assert moments.touch.shape[:2] == (18, 2) and moments.stride == 2
-    facts = {"path": str(tmp_path / "videos"), "recordings": 2, "held_out": 2}
-    assert touch.recipe["data"] == {"train": [facts], "validation": []}
 
 
 def test_several_folders_are_learned_from_together(tmp_path: Path) -> None:
@@ -103,12 +98,8 @@ def test_what_cannot_be_learned_from_together_is_one_line(tmp_path: Path) -> Non
     write_slides(tmp_path / "slides", ("mug",))
     with pytest.raises(UserError, match="slides was recorded with digit, not gelsight_mini"):
         open_touch([videos, tmp_path / "slides"], (), None)
-    with pytest.raises(UserError, match="was recorded with gelsight_mini, not digit"):
-        open_touch([videos], (), "digit")
     with pytest.raises(UserError, match="videos holds no recordings out: .* --validation"):
         open_touch([write_videos(tmp_path / "a" / "videos", ("train",))], (), None)
-    with pytest.raises(UserError, match="has no video to train on: .* train or unlabelled"):
-        open_touch([write_videos(tmp_path / "held", ("val",))], (), None)
     with pytest.raises(UserError, match="leave --validation out"):
         open_touch([videos], [tmp_path / "slides" / ".." / "videos"], None)
 
@@ -156,12 +147,10 @@ def test_a_pause_at_the_start_is_found() -> None:
     state, action = np.zeros((30, 15), np.float32), np.zeros((30, 8), np.float32)
     action[:, 7], state[:, 14] = 0.08, 0.08
     state[:, 0] += np.random.default_rng(0).normal(0, 1e-4, 30)  # encoder noise is no motion
-    still = Episode({ft.STATE: state, ft.ACTION: action}, "wait")
-    moving = Episode({ft.STATE: state.copy(), ft.ACTION: action.copy()}, "wait, then go")
-    moving.frames[ft.ACTION][12:, 1] = 0.01
-    closing = Episode({ft.STATE: state, ft.ACTION: action.copy()}, "wait, then close")
-    closing.frames[ft.ACTION][5:, 7] = 0.0
-    assert [leading_pause(episode) for episode in (still, moving, closing)] == [0, 12, 5]
+    moving, closing = action.copy(), action.copy()
+    moving[12:, 1], closing[5:, 7] = 0.01, 0.0
+    for done, pause in ((action, 0), (moving, 12), (closing, 5)):
+        assert leading_pause(Episode({ft.STATE: state, ft.ACTION: done}, "wait")) == pause
 
 
 STRIDE = 3
