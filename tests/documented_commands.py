@@ -19,7 +19,6 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").g
 # What a command is given, or given instead, so that it ends within seconds. The first line whose
 # words begin the command counts. An option that is there gets the new value, another one is added.
 TOY = {
-    "run-policy --task bead-maze": "--episodes 1 --workers 1 --no-video --env.max-seconds 1",
     "run-policy": "--episodes 1 --workers 1 --no-video --env.max-seconds 1",
     "collect-demos --task bead-maze --policy": "--episodes 1 --workers 1 --env.max-seconds 1",
     "collect-demos --task bead-maze": "--episodes 1 --workers 1 --env.cameras --env.disturbance 0",
@@ -59,17 +58,11 @@ NOT_RUN = {
 
 @dataclass(frozen=True)
 class Command:
-    """One line to type.
+    """One line to type."""
 
-    Attributes:
-        page: where it is printed.
-        line: as it is printed, without its comment.
-        whole: it stands in a block, to be typed as it is; else in the text, perhaps in part.
-    """
-
-    page: str
-    line: str
-    whole: bool
+    page: str  # where it is printed
+    line: str  # as it is printed, without its comment
+    whole: bool  # stands in a block, to be typed as it is; else in the text, perhaps in part
 
     @property
     def words(self) -> list[str]:

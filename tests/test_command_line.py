@@ -6,14 +6,13 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from PIL import Image
 
 import touchgoal
 from touchgoal import __version__
@@ -22,7 +21,7 @@ from touchgoal.launch.list import KINDS
 from touchgoal.launch.support.command_line import SHOWN, _all_options, _members, docstrings, parse
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.interruption import Terminated, on_interruption, terminable
+from touchgoal.runtime.interruption import on_interruption, terminable
 from touchgoal.runtime.option_types import OptionError, checked_dataclass
 from touchgoal.runtime.run_folder import check_writable, open_run
 from touchgoal.sim_envs.config import (
@@ -58,8 +57,6 @@ def test_env_options_are_those_of_the_task(capsys: pytest.CaptureFixture) -> Non
     assert options("--env.mass", "0.1", "0.2").env.mass == (0.1, 0.2)
     with pytest.raises(UserError, match="--env.bead is an option of the task bead-maze: --task be"):
         options("--env.bead", "cylinder")
-    with pytest.raises(UserError, match="--env.mass is an option of the task pick-place"):
-        options("--task=bead-maze", "--env.mass", "0.1", "0.2")
     capsys.readouterr()
     with pytest.raises(SystemExit):
         options("--task", "bead-maze", "--help")
@@ -67,12 +64,8 @@ def test_env_options_are_those_of_the_task(capsys: pytest.CaptureFixture) -> Non
 
 
 def test_a_bad_value_names_the_option_as_it_was_typed() -> None:
-    with pytest.raises(
-        UserError, match="^--env.control-hz must be greater than or equal to 1, not 0"
-    ):
+    with pytest.raises(UserError, match="^--env.control-hz must be greater than or equal to 1, no"):
         options("--env.control-hz", "0")
-    with pytest.raises(UserError, match="^--env.mass must be a finite number, not nan$"):
-        options("--env.mass", "nan", "nan")
 
 
 def test_help_shows_the_first_options_and_help_all_shows_all(capsys: pytest.CaptureFixture) -> None:
@@ -86,29 +79,17 @@ def test_help_shows_the_first_options_and_help_all_shows_all(capsys: pytest.Capt
     assert "--env.timestep" in capsys.readouterr().out
 
 
-def test_arguments_and_the_folder_have_names_and_defaults(capsys: pytest.CaptureFixture) -> None:
-    for name, usage in {
-        "check-sensor": "[OPTIONS] SOURCE",
-        "reward-curves": "[OPTIONS] SOURCE",
-        "completion": "{bash,zsh,fish}",
-    }.items():
-        with pytest.raises(SystemExit):
-            main([name, "--help"])
-        assert usage in (printed := capsys.readouterr().out)
-        if name != "completion":
-            assert "runs/<date>_<command>" in printed
-    with pytest.raises(SystemExit):
-        main(["pull", "--help"])
-    assert "runs/<date>_<command>" not in capsys.readouterr().out  # it says its own default
-
-
-def test_paragraphs_of_help_are_joined(capsys: pytest.CaptureFixture) -> None:
+def test_help_joins_paragraphs_and_says_defaults(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit):
         main(["fit-normalizer", "--help"])
     printed = capsys.readouterr().out
     assert "With --value it also" in " ".join(printed.split())
     assert not any(line.startswith("--value") for line in printed.splitlines())
     assert "1 more option, rarely needed" in printed and "(default: )" not in printed
+    for name, dated in (("reward-curves", True), ("pull", False)):  # which says its own default
+        with pytest.raises(SystemExit):
+            main([name, "--help"])
+        assert ("runs/<date>_<command>" in capsys.readouterr().out) == dated
 
 
 def test_a_mistyped_option_or_command_is_guessed(capsys: pytest.CaptureFixture) -> None:
@@ -136,23 +117,6 @@ def test_the_interface_alone_is_listed() -> None:
     assert names == wanted.split()
 
 
-def test_an_ascii_terminal_takes_any_file_name(tmp_path: Path) -> None:
-    """A folder of images with an umlaut is named, and the mistake after it is one line."""
-    folder = tmp_path / "B\u00e4lle"
-    folder.mkdir()
-    for i in range(2):
-        Image.new("RGB", (32, 32)).save(folder / f"{i}.png")
-    command = [sys.executable, "-m", "touchgoal.launch", "reward-curves", str(folder)]
-    result = subprocess.run(
-        [*command, "--goal", "image:none.png"],
-        env={**os.environ, "PYTHONIOENCODING": "ascii"},
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 1 and "B\\xe4lle: 2 frames" in result.stdout
-    assert result.stderr.splitlines()[-1].endswith("none.png does not exist")
-
-
 def test_completion(capsys: pytest.CaptureFixture) -> None:
     main(["completion", "bash"])
     script = capsys.readouterr().out
@@ -162,8 +126,6 @@ def test_completion(capsys: pytest.CaptureFixture) -> None:
 def test_out_is_probed_before_any_work(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()
-    with pytest.raises(UserError, match="is a file; name a folder"):
-        check_writable(file / "deeper")
     with pytest.raises(SystemExit, match="--out: .*file is a file"):
         main(["demo", "--out", str(file)])
     with pytest.raises(UserError, match="cannot write in /proc"):
@@ -181,18 +143,14 @@ def test_a_folder_keeps_the_record_of_every_run(tmp_path: Path) -> None:
     open_run(tmp_path, "toy", other)  # nothing came of the first one
     (tmp_path / "metrics.json").touch()
     open_run(tmp_path, "toy", other, adds=True)
-    names = ["config.json", "config_2.json", "config_3.json"]
-    assert sorted(p.name for p in tmp_path.glob("config*")) == names
+    assert (tmp_path / "config_2.json").exists() and (tmp_path / "config_3.json").exists()
     with pytest.raises(UserError, match="holds the results of .*; choose another --out"):
         open_run(tmp_path, "toy", one)
-
-
-def test_the_same_run_may_be_repeated(tmp_path: Path) -> None:
-    for _ in range(2):
-        open_run(tmp_path, "toy", Toy(out=tmp_path))
-        (tmp_path / "metrics.json").touch()
+    for _ in range(2):  # the same run again
+        open_run(tmp_path / "again", "toy", one)
+        (tmp_path / "again" / "metrics.json").touch()
     with pytest.raises(UserError, match="holds the results"):
-        open_run(tmp_path, "another", Toy(out=tmp_path))
+        open_run(tmp_path / "again", "another", one)
 
 
 @pytest.mark.parametrize(
@@ -230,24 +188,8 @@ def test_a_reader_who_has_read_enough_is_no_mistake(buffered: bool) -> None:
 
 
 def test_sigterm_is_taken_in_the_main_thread_alone() -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    errors: list[BaseException] = []
-
-    def other() -> None:
-        try:
-            with terminable():
-                pass
-        except BaseException as error:
-            errors.append(error)
-
-    thread = threading.Thread(target=other)
-    thread.start()
-    thread.join()
-    assert not errors
-    with pytest.raises(Terminated), terminable():
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(5)
-    assert signal.getsignal(signal.SIGTERM) is before
+    with ThreadPoolExecutor(1) as other:
+        other.submit(terminable().__enter__).result()
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -271,12 +213,8 @@ def test_every_option_is_described(name: str) -> None:
     ("shell", "message"),
     [
         ('{python} twin --out ""', "--out is empty: give a value or leave the option out"),
-        ("{python} twin --out=", "--out is empty"),
         ("{python} twin --out " + 300 * "x", "--out: cannot write in .*: File name too long"),
-        (
-            "ln -s a b; ln -s b a; {python} twin --out a/run",
-            "--out: a is a link that leads nowhere",
-        ),
+        ("ln -s a b; ln -s b a; {python} twin --out a/run", "--out: a is a link that leads now"),
         ("mkdir gone; cd gone; rmdir ../gone; {python} twin", "the working directory is gone"),
         ("{python} repair Käfer <&- >&-", r"K(ä|\\xe4)fer is not a set of episodes"),
     ],
@@ -317,29 +255,17 @@ def test_one_process_at_a_time_writes_into_a_folder(tmp_path: Path) -> None:
     open_run(tmp_path, "toy", Toy(out=tmp_path))
     line = [sys.executable, "-m", "touchgoal.launch", "twin", "--out", str(tmp_path)]
     done = subprocess.run(line, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr == (
-        f"touchgoal twin: another command is writing into {tmp_path}: wait for it or name another --out\n"
-    )
+    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
+    assert f"another command is writing into {tmp_path}: wait for it" in done.stderr
 
 
 @pytest.mark.parametrize(
     ("config", "values", "message"),
     [
-        (EnvConfig, {"control_hz": 0}, "control_hz must be greater than or equal to 1, not 0"),
-        (EnvConfig, {"camera_size": (128, 1282)}, "camera_size must be less than or equal to 1280"),
         (EnvConfig, {"camera_size": (97, 96)}, "camera_size must be a multiple of 2"),
         (EnvConfig, {"control_hz": 60}, "control_hz is 60; it must divide 500"),
-        (EnvConfig, {"timestep": 0.0015}, "timestep must divide 2 ms"),
-        (EnvConfig, {"max_seconds": 0.01}, "max_seconds must be at least a tick of 1/20 s"),
         (PickPlaceConfig, {"mass": (float("nan"),) * 2}, "mass must be a finite number, not nan"),
         (PickPlaceConfig, {"mass": (0.2, 0.1)}, "mass must go from less to more, not 0.2 to 0.1"),
-        (PickPlaceConfig, {"grasp_force": (500, 500)}, "grasp_force must be less than or equal to"),
-        (
-            PickPlaceConfig,
-            {"objects": ("teapot",)},
-            "objects unknown object 'teapot'; choose from: glass",
-        ),
         (BeadMazeConfig, {"wires": ("knot-1",)}, "wires unknown wire 'knot-1'"),
     ],
 )
@@ -354,6 +280,4 @@ def test_a_value_out_of_range_is_one_line(
 def test_named_wires_are_taken_in_turn() -> None:
     config = BeadMazeConfig(wires=("helix-1", "arc-2000009"))
     assert [w.name for w in config.chosen_wires(3)] == ["helix-1", "arc-2000009", "helix-1"]
-    assert len(config.chosen_wires()) == 2
-    assert len(BeadMazeConfig(n_wires=5).chosen_wires()) == 5
     assert len(BeadMazeConfig(split="validation").chosen_wires()) == 80  # all there are

@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,8 +66,6 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture) -> None:
             run(name, "--help")
         assert stopped.value.code == 0
     assert "--env.grasp-force" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="there is no command 'trian'"):
-        run("trian")
 
 
 def test_collected_episodes_are_sound(episodes: Path, capsys: pytest.CaptureFixture) -> None:
@@ -98,19 +95,6 @@ def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_train_encoder_then_use_it(episodes: Path, validation: Path, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    run("train-encoder", "align", "--data", episodes, "--validation", validation, "--out", out,
-        "--align.backbone", "vit-tiny", "--align.epochs", 12, "--align.batch-size", 32)  # fmt: skip
-    recipe = pretrained.ENCODER_FORMAT.provenance(out / "encoder")
-    assert recipe["data"]["train"]["episodes"] == 2 and recipe["command"].startswith("touchgoal")
-    run("reward-curves", episodes, "--encoder", out / "encoder", "--index", 1,
-        "--out", tmp_path / "curves")  # fmt: skip
-    report = json.loads((tmp_path / "curves" / "episode_001.json").read_text())
-    assert report["metrics"]["tactile"]["contact_lag"] is not None
-
-
-@pytest.mark.slow
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     run("demo", "--out", tmp_path, "--env.max-seconds", 2.6)
     for name in ("episode.mp4", "curves.png", "curves.csv", "metrics.json", "config.json"):
@@ -121,24 +105,14 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert "image+tactile" in printed and str(tmp_path / "curves.png") in printed
 
 
-def test_run_policy(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    run("run-policy", "--episodes", 2, "--env.objects", "toy_brick", "--policy", "expert", "--no-video",
-        "--out", tmp_path)  # fmt: skip
-    assert "2/2 [0.34, 1.00]" in capsys.readouterr().out
-    assert json.loads((tmp_path / "metrics.json").read_text())["successes"] == 2
-
-
 def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    maze = "--task bead-maze --workers 1".split()
-    run("collect-demos", *maze, "--episodes", 1, "--env.max-seconds", 1, "--out", tmp_path / "a")
+    maze = "--task bead-maze --workers 1 --episodes 1 --out".split()
+    run("collect-demos", *maze, tmp_path / "a", "--env.max-seconds", 1)
     found = EpisodeSet(tmp_path / "a" / "episodes")
     assert found.lengths[0] == 21 and found.meta(0)["wire"] == "fourier-2000000"
     assert found.meta(0)["outcome"] == "failure" and found.meta(0)["disturbance"] == 0.004
-    run("run-policy", *maze, "--episodes", 1, "--policy", "follower", "--no-video", "--out",
-        tmp_path / "b")  # fmt: skip
+    run("run-policy", *maze, tmp_path / "b", "--policy", "follower", "--no-video")
     assert "1/1 [0.21, 1.00]" in capsys.readouterr().out
-    message = refused(capsys, "run-policy", "--policy", "follower", "--out", tmp_path / "c")
-    assert "add: --task bead-maze" in message and not (tmp_path / "c").exists()
 
 
 @pytest.mark.slow
@@ -197,13 +171,9 @@ def test_learning_the_bead_maze(
     paper = checkpoint.load(Path("paper/policy")).config
     assert paper.representation == "delta" and paper.touch_input == "embedding"
     assert Path("paper/policy/touch/encoder.json").is_file()
-    missing = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "nowhere")
-    assert "there is no policy 'nowhere': choose from expert" in missing
     other = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "policy/policy",
                     "--env.sensor", "gelsight_mini")  # fmt: skip
     assert "trained with the sensor gelsight_mini_markers" in other
-    other = refused(capsys, "run-policy", "--policy", "policy/policy")
-    assert "was trained for bead-maze, not for pick-place" in other
 
 
 @pytest.mark.slow
@@ -213,18 +183,8 @@ def test_learning_to_pick_and_place(
     """The commands from placements to a corrected policy, at toy size."""
     monkeypatch.chdir(tmp_path)
     one, blind = ("--workers", 1), ("--env.no-tactile", "--env.cameras", "--out", "demos")
-    run(
-        "train-pose-estimator",
-        *one,
-        "--objects",
-        2,
-        "--placements",
-        2,
-        "--train.epochs",
-        1,
-        "--out",
-        "est",
-    )
+    run("train-pose-estimator", *one, "--objects", 2, "--placements", 2, "--train.epochs", 1,
+        "--out", "est")  # fmt: skip
     record = ("collect-demos", "--feedback", "--episodes", 1, *one)
     run(*record, *blind)
     run(*record, "--seed", 1, *blind[:2], "--out", "val")
@@ -252,9 +212,8 @@ def test_a_shipped_policy_is_made_by_one_command(
     make = "make-policy --demonstrations 2 --corrections 1 --rounds 1 --epochs 1 --trials 0 --workers 1 --out made"
     run(*make.split())
     recipe = json.loads(Path("made/policy/policy/recipe.json").read_text())
-    assert [s["command"].split()[1] for s in recipe["steps"]] == [
-        *["collect-demos"] * 2, "train-policy", "collect-demos", "train-policy",
-    ]  # fmt: skip
+    steps = [s["command"].split()[1] for s in recipe["steps"]]
+    assert steps == ["collect-demos", *2 * ["collect-demos", "train-policy"]]
     capsys.readouterr()
     run(*make.replace("--workers 1", "--workers 2").split(), "--resume")  # nothing is left to do
     assert "5 steps" in capsys.readouterr().out and "collect-demos" not in capsys.readouterr().out
@@ -279,11 +238,8 @@ def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(recording, "TRAINING_OBJECTS", ("candle", "soda_can"))
     monkeypatch.setattr("touchgoal.rewards.value.fit_value._STEPS", 5)
     sizes = "--episodes 1 --suboptimal 1 --successes 2 --training 4 --goals 1 --calibration 9"
-    run(
-        *f"benchmark reward-quality {sizes} --scenes fixed --every 2 --env.control-hz 5 --env.camera-size 64 64".split(),
-        "--out",
-        tmp_path,
-    )
+    words = f"benchmark reward-quality {sizes} --scenes fixed --every 2 --env.control-hz 5"
+    run(*words.split(), "--env.camera-size", 64, 64, "--out", tmp_path)
     result = json.loads((tmp_path / "metrics.json").read_text())["scenes"]["fixed"]
     assert set(result["auc"]) == {*kinds, "mean of true kinds"}
     assert result["episodes"] == dict.fromkeys(outcomes, 1) | {"success": 2}
@@ -297,9 +253,6 @@ def test_mistakes_leave_nothing(
     curves = ("reward-curves", episodes, "--out", out)
     message = refused(capsys, "collect-demos", "--env.objects", "teapot", "--out", out)
     assert "unknown object 'teapot'; choose from: glass_ball" in message
-    assert "does not exist" in refused(capsys, "reward-curves", tmp_path / "none", "--out", out)
-    assert "is not understood" in refused(capsys, *curves, "--goal", "lst")
-    assert "lies beyond" in refused(capsys, *curves, "--goal", "frame:999")
     assert "has no episode 7" in refused(capsys, *curves, "--index", 7)
     no_weights = refused(capsys, *curves, "--encoder", tmp_path)
     assert "train one with: touchgoal train-encoder" in no_weights
@@ -322,29 +275,10 @@ def test_wrong_data_for_an_encoder(
     assert "was recorded with gelsight_mini, not" in message and not out.exists()
     same = ("--data", episodes, "--validation", episodes)
     assert "validate on episodes" in refused(capsys, "train-encoder", "mae", *same, "--out", out)
-    nothing = refused(capsys, "train-encoder", "mae", *both, "--resume", "--out", out)
-    assert "nothing to resume" in nothing and not out.exists()
     meta = EpisodeSet.meta
     monkeypatch.setattr(EpisodeSet, "meta", lambda self, i: meta(self, i) | {"success": None})
     unknown = refused(capsys, "train-encoder", "align", *both, "--out", out)
     assert "is marked as a success" in unknown and not out.exists()
-
-
-def test_corrupt_episode_is_skipped_and_named(
-    episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    broken, out = tmp_path / "episodes", tmp_path / "out"
-    shutil.copytree(episodes, broken)
-    data = sorted(broken.rglob("data/**/*.parquet"))
-    data[0].write_bytes(data[0].read_bytes()[:1000])
-    run("reward-curves", broken, "--out", out, "--encoder", "gelsight_mini")
-    assert f"1 of 2 skipped, see {out / 'skipped.csv'}" in capsys.readouterr().out
-    [row] = (out / "skipped.csv").read_text().splitlines()[1:]
-    assert row.startswith("episode_000,") and data[0].name in row and "repair" in row
-    assert {p.name for p in out.glob("*.csv")} == {"skipped.csv", "episode_001.csv"}
-    next(broken.rglob("observation.images.front/**/*001.mp4")).unlink()
-    message = refused(capsys, "reward-curves", broken, "--out", tmp_path / "none")
-    assert "nothing could be measured" in message and data[0].name in message
 
 
 def test_encoder_speed_prints_every_encoder_beside_its_peer(
@@ -359,6 +293,3 @@ def test_encoder_speed_prints_every_encoder_beside_its_peer(
     assert "Sparsh mae-tiny, random" in printed
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
     assert [row["precision"] for row in rows] == ["fp32", "bf16", "fp32", "fp32", "bf16"]
-    assert all(
-        (row["batched_ratio"] is None) == (row["encoder"] == "gelsight_mini") for row in rows
-    )

@@ -69,17 +69,10 @@ def test_command_is_understood(
         assert not command.whole and "required" in complaint.lower(), complaint
 
 
-@pytest.mark.parametrize(
-    "target",
-    [
-        "demo",
-        "weights",
-        "weights-markers",
-        "maze-policy",
-        "maze-diffusion-policy",
-        "pick-place-policy",
-    ],
-)
+TARGETS = "demo weights weights-markers maze-policy maze-diffusion-policy pick-place-policy".split()
+
+
+@pytest.mark.parametrize("target", TARGETS)
 def test_recipes_of_the_makefile_are_understood(
     target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

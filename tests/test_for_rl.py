@@ -20,9 +20,8 @@ def test_keys_actions_and_touch() -> None:
     env = touchgoal.make("pick-place", for_rl=True, cameras=(), **SHORT)
     check_env(env)
     observation, _ = env.reset(seed=0)
-    assert set(observation) == {
-        "state", "command", "tcp_pose", "wrench", "tactile_left", "tactile_right"
-    }  # fmt: skip
+    keys = "state command tcp_pose wrench tactile_left tactile_right"
+    assert set(observation) == set(keys.split())
     assert observation["tactile_left"].shape == (*TACTILE_SIZE, 3)
     plain = touchgoal.make("pick-place", cameras=(), **SHORT)
     plain.reset(seed=0)

@@ -53,9 +53,8 @@ def test_from_recordings_with_cameras_to_a_policy_that_sees(
     policy = load_policy("policy")
     env = policy.env_config(PickPlaceConfig(control_hz=10))
     assert env.cameras == ("front", "wrist") and env.camera_size == (64, 64) and not env.tactile
-    seen = {
-        key: value[0] for key, value in EpisodeSet(Path("demos/episodes")).read(0).frames.items()
-    }
+    recorded = EpisodeSet(Path("demos/episodes")).read(0).frames
+    seen = {key: values[0] for key, values in recorded.items()}
     moved = policy.act(seen)
     policy.reset()
     blind = policy.act(seen | {ft.FRONT: np.zeros_like(seen[ft.FRONT])})

@@ -9,17 +9,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-ORDER = [
-    "runtime",
-    "control",
-    "sim_envs",
-    "episodes",
-    "encoders",
-    "rewards",
-    "policies",
-    "benchmarks",
-    "launch",
-]
+ORDER = "runtime control sim_envs episodes encoders rewards policies benchmarks launch".split()
+SOURCES = sorted(p for f in ORDER for p in (ROOT / f).rglob("*.py"))
 FORBIDDEN = {"rewards": {"policies"}, "policies": {"rewards"}}
 
 
@@ -44,9 +35,7 @@ def test_folder_is_linked_and_bare(folder: str) -> None:
     assert not (ROOT / folder / "__init__.py").exists(), "would shadow python-control and ROS"
 
 
-@pytest.mark.parametrize(
-    "path", sorted(p for f in ORDER for p in (ROOT / f).rglob("*.py")), ids=str
-)
+@pytest.mark.parametrize("path", SOURCES, ids=str)
 def test_imports_point_left(path: Path) -> None:
     folder = path.relative_to(ROOT).parts[0]
     modules = imported_modules(path)
@@ -57,13 +46,7 @@ def test_imports_point_left(path: Path) -> None:
 
 
 def test_files_stay_small() -> None:
-    long = {
-        str(p.relative_to(ROOT)): n
-        for f in ORDER
-        for p in (ROOT / f).rglob("*.py")
-        if (n := len(p.read_text().splitlines())) > 400
-    }
-    assert not long
+    assert not [str(p) for p in SOURCES if len(p.read_text().splitlines()) > 400]
 
 
 def test_version_is_said_once() -> None:
@@ -88,12 +71,8 @@ def test_every_data_file_is_packaged() -> None:
 
 
 def test_control_needs_no_torch() -> None:
-    files = (
-        p.relative_to(ROOT).with_suffix("")
-        for folder in ("runtime", "control")
-        for p in (ROOT / folder).rglob("*.py")
-    )
-    modules = ["touchgoal." + ".".join(f.parts) for f in files]
+    files = [p.relative_to(ROOT).with_suffix("").parts for p in SOURCES]
+    modules = [".".join(("touchgoal", *f)) for f in files if f[0] in ("runtime", "control")]
     program = f"import sys, {', '.join(modules)}; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)
 
@@ -106,7 +85,4 @@ def test_the_robots_pc_needs_neither_torch_nor_mujoco() -> None:
 
 def test_code_cites_published_sources() -> None:
     """Notes that only the authors have are no source for a limit or a constant."""
-    private = [
-        str(p) for f in ORDER for p in (ROOT / f).rglob("*.py") if "shared/" in p.read_text()
-    ]
-    assert not private
+    assert not [str(p) for p in SOURCES if "shared/" in p.read_text()]

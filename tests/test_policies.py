@@ -9,17 +9,15 @@ import pytest
 import torch
 
 from touchgoal.control import features as ft
-from touchgoal.encoders.training.run import open_training
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.recording import EpisodeSpec, episode_specs
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.launch import train_policy
 from touchgoal.launch.__main__ import main
 from touchgoal.policies import checkpoint
 from touchgoal.policies.by_name import prepare_policy
-from touchgoal.policies.checkpoint import SHIPPED_POLICIES, load_policy
+from touchgoal.policies.checkpoint import load_policy
 from touchgoal.policies.evaluation import evaluate as evaluation
 from touchgoal.policies.evaluation.evaluate import evaluate, run_trials, trial_specs
 from touchgoal.policies.evaluation.report import film_trials
@@ -28,9 +26,6 @@ from touchgoal.policies.evaluation.table import table
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.training.training_data import choose_episodes, common_sensor, find_task
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.folder_lock import FolderLock
-from touchgoal.runtime.provenance import portable
-from touchgoal.runtime.run_folder import release_runs
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.tasks import make_env
@@ -49,9 +44,7 @@ def test_trials_depend_on_their_seed_alone() -> None:
     config = PickPlaceConfig(cameras=(), tactile=False)
     jobs = [EpisodeSpec(seed, options={"object": "toy_brick"}) for seed in (1, 2)]
     apart = [run_trials(config, PickPlaceExpert, [job], workers=1) for job in jobs]
-    assert list(run_trials(config, PickPlaceExpert, jobs, workers=2)) == [
-        t for r in apart for t in r
-    ]
+    assert list(run_trials(config, PickPlaceExpert, jobs, workers=2)) == [t for (t,) in apart]
 
 
 def test_what_ships_picks_and_places() -> None:
@@ -96,10 +89,7 @@ def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
     assert Still.episodes == 4  # the file was imported anew, as in a worker
     for name, message in {
         f"{__file__}:Stil": "has no Stil: did you mean Still",
-        f"{tmp_path}/none.py:Still": "no file",
-        "no_such_module:Policy": "cannot import no_such_module",
         f"{__file__}:Path": "has no method reset",
-        "shiped": "did you mean shipped",
         "pick-plac": "did you mean pick-place",
         "bead-maze": "was trained for bead-maze, not for pick-place",
         "follower": "add: --task bead-maze",
@@ -107,25 +97,14 @@ def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
     }.items():
         with pytest.raises(UserError, match=message):
             prepare_policy(name, config)
-    with pytest.raises(UserError, match="there is no task 'pick'"):
-        evaluate("expert", "pick")
 
 
 @pytest.mark.parametrize(
     ("policy", "options", "message"),
     [
         ("shipped", {"tactile": False}, r"--env\.no-tactile: .* runs with --env\.tactile; leave"),
-        ("shipped", {"cameras": ()}, r"--env\.cameras: .* runs with --env\.cameras front"),
-        (
-            "shipped",
-            {"camera_size": (64, 64)},
-            r"camera-size 64 64: .* runs with --env\.camera-size 256 256",
-        ),
-        (
-            "expert",
-            {"camera_size": (64, 64)},
-            "camera-size 64 64: the policy expert reads no camera",
-        ),
+        ("shipped", {"camera_size": (64, 64)}, r"runs with --env\.camera-size 256 256"),
+        ("expert", {"camera_size": (64, 64)}, "the policy expert reads no camera"),
         ("shipped", {"arm": "ur5e"}, "seven joints of an FR3"),
     ],
 )
@@ -136,31 +115,26 @@ def test_an_option_that_the_policy_fixes_is_not_overridden(
         prepare_policy(policy, PickPlaceConfig(**options))
 
 
-class Seven(Still):
+class Answering(Still):
+    answer = np.zeros(7)
+
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        return np.zeros(7)
+        return self.answer
 
 
-class NotANumber(Still):
-    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        return np.full(8, np.nan)
+class NotANumber(Answering):
+    answer = np.full(8, np.nan)
 
 
-class Sized(Still):
-    def __init__(self, size: int) -> None: ...
-
-
-class Degrees(Still):
-    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        return np.full(8, 57.0)
+class Degrees(Answering):
+    answer = np.full(8, 57.0)
 
 
 def test_a_wrong_policy_of_ones_own_is_one_line_with_its_name() -> None:
     config = PickPlaceConfig(max_seconds=0.2)
     for policy, message in {
-        Seven: r"Seven: act gave an array of shape \(7,\); return 7 joint changes",
+        Answering: r"Answering: act gave an array of shape \(7,\); return 7 joint changes",
         NotANumber: r"NotANumber: act gave \[nan, ",
-        Sized: "Sized: missing a required argument: 'size'",
     }.items():
         with pytest.raises(UserError, match=message):
             evaluate(policy, config, episodes=1)
@@ -267,24 +241,6 @@ def test_only_what_is_known_to_be_good_is_learned_from(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="more than one task"):
         find_task([(episodes, [0]), (arm, [0])], None)
     assert common_sensor([(arm, [0])]) == "digit"
-
-
-def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
-    config = train_policy.Config(data=tmp_path / "a", validation=tmp_path / "b", out=tmp_path)
-    held = FolderLock(tmp_path)
-    with pytest.raises(UserError, match="another command is writing into"):
-        open_training(config, "train-policy")
-    held.release()
-    open_training(config, "train-policy")
-    release_runs()
-
-
-def test_shipped_records_name_no_folder_of_a_machine() -> None:
-    records = list(SHIPPED_POLICIES["pick-place"].parent.rglob("*.json"))
-    assert len(records) == 7
-    for path in records:
-        record = json.loads(path.read_text())
-        assert portable(record) == record
 
 
 def test_the_films_show_the_trials(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """The diffusion policy's core: representations, windows, training, files."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +31,7 @@ from touchgoal.policies.actions import Normalizer, to_actions, to_representation
 from touchgoal.policies.config import ActionRepresentation, TrainConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.heads.mlp import MLPConfig
-from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
+from touchgoal.policies.network import PolicyConfig
 from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.training import train as train_module
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
@@ -45,10 +44,8 @@ import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platfor
 
 @pytest.mark.parametrize("kind", ["delta", "relative", "absolute", "base_twist"])
 def test_representations_round_trip(kind: ActionRepresentation) -> None:
-    actions, joints = (
-        torch.randn(5, 8, 8, generator=torch_rng()),
-        torch.randn(5, 7, generator=torch_rng(1)),
-    )
+    actions = torch.randn(5, 8, 8, generator=torch_rng())
+    joints = torch.randn(5, 7, generator=torch_rng(1))
     represented = to_representation(actions, joints, kind)
     torch.testing.assert_close(to_actions(represented, joints, kind), actions, rtol=1e-4, atol=1e-4)
     if kind == "absolute":
@@ -97,15 +94,12 @@ def test_scales_round_trip_and_keep_constants() -> None:
 
 def test_windows_stay_inside_their_episode() -> None:
     windows = toy_dataset(TOY, (3, 20))
-    recorded = windows.recorded
     condition, actions = windows.take(torch.tensor([0, 2, 3, 22]))
-    state, done = recorded.state, recorded.actions
-    torch.testing.assert_close(condition.state[0], state[[0, 0]])
-    torch.testing.assert_close(condition.state[1], state[[1, 2]])
-    torch.testing.assert_close(condition.state[2], state[[3, 3]])
-    torch.testing.assert_close(actions[1], done[[2] * 8])
-    torch.testing.assert_close(actions[2], done[3:11])
-    torch.testing.assert_close(actions[3], done[[22] * 8])
+    state, done = windows.recorded.state, windows.recorded.actions
+    for i, seen in enumerate(([0, 0], [1, 2], [3, 3])):
+        torch.testing.assert_close(condition.state[i], state[seen])
+    for i, rows in ((1, [2] * 8), (2, range(3, 11)), (3, [22] * 8)):
+        torch.testing.assert_close(actions[i], done[list(rows)])
     torch.testing.assert_close(windows.actions[3], actions[2])
 
 
@@ -169,8 +163,6 @@ def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
 
 
 CONFIG = TrainConfig(epochs=3, batch_size=8, lr=1e-3, snapshot_epochs=2)
-
-
 SEED = TrainerOptions(seed=4)
 
 
@@ -192,8 +184,6 @@ def test_a_killed_training_ends_as_an_uninterrupted_one(
         train(TOY, windows, other, CONFIG, killed_run, SEED, {})
     (note,) = stop.value.__notes__
     assert "2 of 3 epochs are saved" in note and "--resume" in note
-    with pytest.raises(UserError, match="resume it"):
-        train(TOY, windows, other, CONFIG, killed_run, SEED, {})
     go_on = replace(SEED, resume=True)
     with pytest.raises(UserError, match=r"seed was 4, is 5\): resume with its own"):
         train(TOY, windows, other, CONFIG, killed_run, replace(go_on, seed=5), {})
@@ -252,25 +242,20 @@ def test_a_turn_looks_the_same_by_either_quaternion() -> None:
     np.testing.assert_allclose(seen[0, 18:].reshape(2, 3).T, matrix.reshape(3, 3)[:, :2], atol=1e-6)
 
 
-def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="no policy in"):
-        checkpoint.load(tmp_path)
-    checkpoint.save(PolicyNetwork(TOY), tmp_path, {})
-    path = tmp_path / "policy.json"
-    description = json.loads(path.read_text())
-    del description["config"]["head"]
-    path.write_text(json.dumps(description))
-    with pytest.raises(UserError, match="damaged"):
-        checkpoint.load(tmp_path)
+def record_ticks(root: Path, *episodes: list[dict[str, np.ndarray]]) -> Path:
+    """Record episodes; where a tick names no action, part of its state stands for one."""
+    for observed in episodes:
+        ticks = [{ft.ACTION: tick[ft.STATE][:8], **tick} for tick in observed]
+        frames = {key: np.stack([tick[key] for tick in ticks]) for key in ticks[0]}
+        EpisodeWriter(root).append(Episode(frames, "feel"))
+    return root
 
 
 def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    writer, embedder = EpisodeWriter(tmp_path / "set/episodes"), toy_touch_embedder()
+    embedder = toy_touch_embedder()
     config = replace(TOY, touch_dim=embedder.dim, touch_input="embedding")
-    for n in (4, 6):
-        ticks = [{**tick, ft.ACTION: tick[ft.STATE][:8]} for tick in toy_observations(n)]
-        writer.append(Episode({k: np.stack([t[k] for t in ticks]) for k in ticks[0]}, "feel"))
-    episodes = EpisodeSet(tmp_path / "set/episodes")
+    ticks = toy_observations(4), toy_observations(6)
+    episodes = EpisodeSet(record_ticks(tmp_path / "set/episodes", *ticks))
     first = load_recordings(episodes, [0, 1], config, embedder)
     monkeypatch.setattr(embedder, "embed", lambda *_: pytest.fail("a second embedding"))
     again = load_recordings(episodes, [1], config, embedder)
@@ -289,29 +274,17 @@ def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         load_recordings(episodes, [0], config, embedder)
     with pytest.raises(UserError, match='choose touch_input "embedding"'):
         load_recordings(episodes, [0], replace(config, touch_input="wrench"), embedder)
-    with pytest.raises(UserError, match="make its config"):
-        load_recordings(episodes, [0], config, None)
     blind = load_recordings(episodes, [0], replace(config, touch_dim=0, touch=""), None)
     assert blind.touch.shape == (4, 0)
-    PolicyNetwork(replace(config, touch_dim=0)).plan(
-        ObservationBatch(blind.touch[None, :2].float(), blind.state[None, :2]), torch_rng()
-    )
 
 
 def test_two_sets_beside_each_other_share_no_embeddings(tmp_path: Path) -> None:
-    embedder = toy_touch_embedder()
+    embedder, touches = toy_touch_embedder(), []
     config = replace(TOY, touch_dim=embedder.dim, touch_input="embedding")
-    touches = []
-    for name, first in (("one", 0), ("two", 1)):
-        ticks = [
-            {**tick, ft.ACTION: tick[ft.STATE][:8]} for tick in toy_observations(5)[first:][:4]
-        ]
-        frames = {k: np.stack([t[k] for t in ticks]) for k in ticks[0]}
-        EpisodeWriter(tmp_path / name).append(Episode(frames, "feel"))
-        episodes = EpisodeSet(tmp_path / name)
+    for first in (0, 1):
+        episodes = EpisodeSet(record_ticks(tmp_path / str(first), toy_observations(5)[first:][:4]))
         touches.append(load_recordings(episodes, [0], config, embedder).touch)
-        fresh = torch.from_numpy(embedder.embed(episodes, 0)).half()
-        assert torch.equal(touches[-1], fresh)
+        assert torch.equal(touches[-1], torch.from_numpy(embedder.embed(episodes, 0)).half())
     assert not torch.equal(*touches)
 
 
@@ -322,9 +295,7 @@ def test_a_pause_at_the_start_is_reported_and_left_out(
     ticks = toy_observations(30)
     still = [{**ticks[0], ft.ACTION: np.zeros(8, np.float32)} for _ in range(15)]
     moving = [{**tick, ft.ACTION: np.full(8, 0.1, np.float32)} for tick in ticks[1:16]]
-    frames = {key: np.stack([tick[key] for tick in [*still, *moving]]) for key in still[0]}
-    EpisodeWriter(tmp_path / "set").append(Episode(frames, "feel"))
-    episodes = EpisodeSet(tmp_path / "set")
+    episodes = EpisodeSet(record_ticks(tmp_path / "set", [*still, *moving]))
     pauses = find_pauses(episodes, [0])
     report_pauses(pauses, 20, trimmed=False)
     assert "1 of 1 episodes begin with a pause of 0.8 to 0.8 s" in capsys.readouterr().out

@@ -152,7 +152,7 @@ def test_the_benchmark_takes_a_hugging_face_model(tmp_path: Path) -> None:
 def test_forces_come_with_their_frames(tmp_path: Path) -> None:
     """Objects grasped once have forces and no cost: no other grasp's end could be the goal."""
     table = ["trial,object", *(f"grasp_{obj},object_{obj}" for obj in range(3))]
-    (tmp_path / "grasps.csv").write_text("name,object\n")
+    (tmp_path / "grasps.csv").write_text("name,object\nball,ball\n")
     with pytest.raises(UserError, match="lacks the column trial"):
         read_force_grasps(tmp_path)
     (tmp_path / "grasps.csv").write_text("\n".join(table))

@@ -6,13 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_policies import (
-    TOY,
-    torch_rng,
-    toy_dataset,
-    toy_observations,
-    toy_policy,
-)
+from toy_policies import TOY, torch_rng, toy_dataset, toy_observations, toy_policy
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.options import TrainerOptions
@@ -32,14 +26,8 @@ from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace
 
-SMALL = PoseEstimatorConfig(
-    (16, 16),
-    crops=((ft.FRONT, (0, 16, 0, 16)),),
-    channels=8,
-    keypoints=4,
-    keypoint_features=4,
-    width=16,
-)
+CROPS = ((ft.FRONT, (0, 16, 0, 16)),)
+SMALL = PoseEstimatorConfig((16, 16), CROPS, channels=8, keypoints=4, keypoint_features=4, width=16)
 
 
 def toy_estimator() -> StateEstimator:
@@ -55,9 +43,8 @@ def test_the_start_is_seen_from_the_hand() -> None:
     left = 2 * (yaw - hand)
     for contact in ([0.0, 1.0], [1.0, 1.0]):  # the object matters, or the goal
         held = contact == [1.0, 1.0]
-        observed = network_input(torch.tensor([pose + contact + start]), columns, "base_twist")[
-            0, 11:
-        ].numpy()
+        row = torch.tensor([pose + contact + start])
+        observed = network_input(row, columns, "base_twist")[0, 11:].numpy()
         way = np.array([0.0, 0.0, -0.17, 0.1, -0.2] if held else [-0.05, 0.05, -0.17, 0.0, 0.0])
         twice = [0.0, 0.0] if held else [np.cos(left), np.sin(left)]
         expected = [*way, *twice, *way / (np.abs(way) + 0.02)]
@@ -99,22 +86,20 @@ def test_a_place_is_learnt(tmp_path: Path) -> None:
     assert train_pose(256, 75, tmp_path) < 15  # 60 by chance
 
 
+SEES = (ft.STATE, ft.TCP_POSE, *ESTIMATED)
+ESTIMATING = replace(TOY, touch_dim=0, touch="", proprioception=SEES, position_noise=0.0)
+
+
 def test_a_policy_acts_on_its_senses() -> None:
-    config = replace(
-        TOY,
-        touch_dim=0,
-        touch="",
-        proprioception=(ft.STATE, ft.TCP_POSE, *ESTIMATED),
-        position_noise=0.0,
-    )
-    policy, ticks = toy_policy(config, toy_dataset(config)).eval(), toy_observations(3)
+    policy = toy_policy(ESTIMATING, toy_dataset(ESTIMATING)).eval()
+    ticks = toy_observations(3)
     for tick in ticks:
         tick[ft.FRONT] = np.zeros((16, 16, 3), np.uint8)
     with pytest.raises(UserError, match=r"truth\.contact"):
         LearnedPolicy(policy, None)
     planner = LearnedPolicy(policy, None, toy_estimator())
     plans = [planner.plan(ticks[i : i + 2]) for i in range(2)]
-    assert plans[0].shape == (config.prediction_horizon, 8) and np.isfinite(plans).all()
+    assert plans[0].shape == (ESTIMATING.prediction_horizon, 8) and np.isfinite(plans).all()
 
 
 def test_a_rearrangement_is_a_beginning() -> None:
@@ -126,9 +111,8 @@ def test_a_rearrangement_is_a_beginning() -> None:
     np.testing.assert_allclose(start[:3], info[ft.TRUTH_OBJECT_POSE][:3], atol=1e-6)
     for place in (start[:2], start[5:]):
         assert (low - 0.01 < place).all() and (place < high + 0.01).all()
-    np.testing.assert_allclose(
-        start[3:5], [np.cos(2 * env.grasp_yaw()), np.sin(2 * env.grasp_yaw())], atol=1e-6
-    )
+    twice = 2 * env.grasp_yaw()
+    np.testing.assert_allclose(start[3:5], [np.cos(twice), np.sin(twice)], atol=1e-6)
     assert np.linalg.norm(observation[ft.TCP_POSE][:3] - [0.45, 0, 0.26]) < 0.06
 
 
@@ -161,18 +145,10 @@ def test_it_gives_way_to_what_it_presses_on() -> None:
 
 
 def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:
-    config = replace(
-        TOY,
-        touch_dim=0,
-        touch="",
-        proprioception=(ft.STATE, ft.TCP_POSE, *ESTIMATED),
-        position_noise=0.0,
-    )
-    checkpoint.save(toy_policy(config, toy_dataset(config)), tmp_path / "learner", {})
-    roles, env = (
-        DaggerRoles(SavedPolicy(tmp_path / "learner")),
-        PickPlace(replace(BLIND, max_seconds=1.0)),
-    )
+    learner = toy_policy(ESTIMATING, toy_dataset(ESTIMATING))
+    checkpoint.save(learner, tmp_path / "learner", {})
+    roles = DaggerRoles(SavedPolicy(tmp_path / "learner"))
+    env = PickPlace(replace(BLIND, max_seconds=1.0))
     episode = record_episode(env, JOB, roles)
     assert episode.meta["outcome"] == CORRECTED
     observation, _ = env.reset(seed=JOB.seed, options=JOB.options)
