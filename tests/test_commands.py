@@ -1,6 +1,5 @@
 """Every command at toy size, and one clear line for every mistake."""
 
-import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -244,22 +243,6 @@ def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert set(result["auc"]) == {*kinds, "mean of true kinds"}
     assert result["episodes"] == dict.fromkeys(outcomes, 1) | {"success": 2}
     assert result["success"]["demonstrations"] == 9 and len(result["claims"]) >= 4
-
-
-def test_mistakes_leave_nothing(
-    episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    curves = ("reward-curves", episodes, "--out", out)
-    message = refused(capsys, "collect-demos", "--env.objects", "teapot", "--out", out)
-    assert "unknown object 'teapot'; choose from: glass_ball" in message
-    assert "has no episode 7" in refused(capsys, *curves, "--index", 7)
-    no_weights = refused(capsys, *curves, "--encoder", tmp_path)
-    assert "train one with: touchgoal train-encoder" in no_weights
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, package=None: None)
-    without_towers = refused(capsys, *curves, "--goal", "text:hard and smooth")
-    assert "is missing: pip install -e '" in without_towers and "[towers]'" in without_towers
-    assert not out.exists()
 
 
 def test_wrong_data_for_an_encoder(
