@@ -149,18 +149,7 @@ def test_learning_the_bead_maze(
         "--changes", "light +10%", "2 ticks late", "--episodes", 1, "--workers", 1)  # fmt: skip
     printed = capsys.readouterr().out
     assert "pick-place, light +10%" in printed and "pick-place, 2 ticks late" in printed
-    run(
-        "benchmark",
-        "audit",
-        "--policy",
-        "expert",
-        "--tasks",
-        "pick-place",
-        "--episodes",
-        1,
-        "--workers",
-        1,
-    )
+    run("benchmark", "audit", "--policy", "expert", "--tasks", "pick-place", "--episodes", 1, *one)
     assert "pick-place, arm's state of another episode" in capsys.readouterr().out
     run("benchmark", "policy-latency", "--policy", "policy/policy", "--repeats", 3,
         "--large-repeats", 0)  # fmt: skip
