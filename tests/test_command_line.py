@@ -234,13 +234,10 @@ def test_a_full_disk_is_one_line_with_the_path(
 ) -> None:
     from touchgoal.launch import list as command
 
-    def fail(_: object) -> None:
-        raise RuntimeError("PytorchStreamWriter failed writing file")
-
     def save(_: object) -> None:
         with atomic_write(tmp_path / "weights") as unfinished:
             unfinished.write_bytes(b"half")
-            fail(unfinished)
+            raise RuntimeError("PytorchStreamWriter failed writing file")
 
     monkeypatch.setattr(command, "main", save)
     with pytest.raises(RuntimeError, match="Pytorch"):

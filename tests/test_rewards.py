@@ -176,13 +176,14 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
     held = replace(good, touch=direction([[90.0] * 20 + [60.0] * 20] * 2))
     misses = [embedded("a" * k, touches=False, jitter=1.0) for k in range(1, 9)]
     other = replace(good, made_with=EmbeddingSource("z", "camera"))
-    for episodes, modality, message in (
+    cases: list[tuple[list[EmbeddedEpisode], Modality, str]] = [
         ([held, held, lost], "text", "nearer the goal in 67% of 3 pairs"),
         ([replace(miss, success=True) for miss in misses], "tactile", "'tactile'"),
         ([good, misses[0]], "image", "a failed"),
         ([good, other], "image", "other encoders"),
         ([], "image", "at least one"),
-    ):
+    ]
+    for episodes, modality, message in cases:
         with pytest.raises(UserError, match=message):
             fit_scene(episodes, [modality])
     normalizer = fit_scene([good, replace(good)], ["image"])

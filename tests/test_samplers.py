@@ -100,8 +100,8 @@ def test_samplers_equal_diffusers(kind: Any, predicted: Any) -> None:
     from diffusers.schedulers.scheduling_ddim import DDIMScheduler  # here: it takes 3 s
     from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
-    options = {"beta_schedule": "squaredcos_cap_v2", "timestep_spacing": "trailing"}
-    options |= {"num_train_timesteps": 100, "prediction_type": predicted}
+    options: dict[str, Any] = {"num_train_timesteps": 100, "prediction_type": predicted}
+    options |= {"beta_schedule": "squaredcos_cap_v2", "timestep_spacing": "trailing"}
     theirs: Any = (DDPMScheduler if kind == "ddpm" else DDIMScheduler)(**options)
     steps = 100 if kind == "ddpm" else 10
     theirs.set_timesteps(steps)
