@@ -91,7 +91,7 @@ def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
 def test_sentences_are_judged_on_objects_never_seen() -> None:
     """Embeddings that encode the ranks score above 0.9, noise scores at chance."""
     rng, objects = np.random.default_rng(0), np.repeat(np.arange(60), 2)
-    ranks = rng.integers(0, 3, (60, 3))[objects]
+    ranks = rng.integers(0, 3, (120, 3))[2 * objects]
     embedded = np.eye(3)[ranks].reshape(120, 9) @ rng.normal(size=(9, 30))
     noise, embed_texts = rng.normal(size=(120, 30)), OfflineTowers().embed_texts
     assert sentences_right(embedded + 0.3 * noise, ranks, objects, embed_texts).mean() > 0.9
