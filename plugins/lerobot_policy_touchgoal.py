@@ -30,14 +30,10 @@ class TouchgoalConfig(PreTrainedConfig):
 
     observation_delta_indices = action_delta_indices = reward_delta_indices = None
 
-    def get_optimizer_preset(self) -> Any:
-        """Refuse to train."""
-        raise NotImplementedError("train with touchgoal train-policy")
-
-    get_scheduler_preset = get_optimizer_preset
-
     def validate_features(self) -> None:
         """Leave the check to the policy, which names what it misses."""
+
+    get_optimizer_preset = get_scheduler_preset = validate_features  # it is not trained here
 
 
 class TouchgoalPolicy(PreTrainedPolicy):
@@ -83,9 +79,5 @@ def make_touchgoal_pre_post_processors(
     config: TouchgoalConfig, dataset_stats: Any = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Return lerobot's pipelines around the policy, which do nothing: it normalises by itself."""
-    after: PolicyProcessorPipeline = PolicyProcessorPipeline(
-        steps=[],
-        to_transition=policy_action_to_transition,
-        to_output=transition_to_policy_action,
-    )
-    return PolicyProcessorPipeline(steps=[]), after
+    names = {"to_transition": policy_action_to_transition, "to_output": transition_to_policy_action}
+    return PolicyProcessorPipeline(steps=[]), PolicyProcessorPipeline(steps=[], **names)

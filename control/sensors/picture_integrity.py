@@ -23,6 +23,8 @@ _ALL_CHANNELS = np.ones((1, 3))  # their sum
 _BANDS = 8  # bands of a picture, checked for frozen parts
 _STRIDE = 4  # pixels between those compared
 _LEARNING = 20  # first pictures, which show the bands that sensor noise changes
+# av 15, which lerobot 0.6 pins, knows no number of threads.
+_THREADS = {"threads": 1} if int(av.__version__.split(".")[0]) > 15 else {}
 _LIVELY = 0.8  # share of them in which a band must change to be watched
 
 
@@ -43,7 +45,7 @@ class JpegDecoder:
             return None
         if not frames or frames[0].is_corrupt:
             return None
-        return self._reformatter.reformat(frames[0], format="rgb24", threads=1).to_ndarray()
+        return self._reformatter.reformat(frames[0], format="rgb24", **_THREADS).to_ndarray()
 
 
 class BrokenBlocks:

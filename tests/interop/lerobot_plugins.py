@@ -1,4 +1,5 @@
-"""touchgoal's policy in touchgoal's environment by lerobot-eval, against touchgoal's own loop.
+"""touchgoal's policy in touchgoal's environment by lerobot-eval, against touchgoal's own loop; a twin's
+arm through lerobot's robot interface.
 
     python tests/interop/lerobot_plugins.py PYTHON      PYTHON: of an environment with lerobot
 
@@ -10,21 +11,32 @@ import os
 import subprocess
 import sys
 import tempfile
+from contextlib import closing
 from pathlib import Path
 
-import touchgoal
-from touchgoal.control.features import TRUTH_SUCCESS
-from touchgoal.policies.acting import LearnedPolicy
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+from running_twin import RunningTwin  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[2]
+import touchgoal  # noqa: E402
+from touchgoal.control.features import TRUTH_SUCCESS  # noqa: E402
+from touchgoal.policies.acting import LearnedPolicy  # noqa: E402
+
+ROOT = HERE.parents[1]
+TWIN = ["--lock-step", "--env.objects", "wooden_block", "--env.cameras", "front"]
 TASK, FIRST_SEED, EPISODES = "pick-place", 1000, 2
 
 
-def evaluate_with_lerobot(python: Path, folder: Path) -> list[tuple[float, bool]]:
+def run_with_plugins(folder: Path, *command: str | Path) -> str:
+    """Run a command of lerobot's environment with the plugins in `folder`; return what it prints."""
+    path = {"PYTHONPATH": f"{folder}:{ROOT / 'src'}", "HF_HUB_OFFLINE": "1"}
+    done = subprocess.run(command, env=os.environ | path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def evaluate_with_lerobot(python: Path, plugins: Path, out: Path) -> list[tuple[float, bool]]:
     """Return the summed reward and the success of each episode, by lerobot-eval."""
-    plugins, out = folder / "plugins", folder / "eval"
-    install = [python, "-m", "pip", "install", "-q", "--no-deps", "--target", plugins]
-    subprocess.run([*install, ROOT / "plugins"], check=True)
     options = {
         "policy.type": "touchgoal",
         "policy.policy": TASK,
@@ -36,12 +48,8 @@ def evaluate_with_lerobot(python: Path, folder: Path) -> list[tuple[float, bool]
         "seed": FIRST_SEED,
         "output_dir": out,
     }
-    subprocess.run(
-        [python.parent / "lerobot-eval", *(f"--{name}={value}" for name, value in options.items())],
-        env=os.environ | {"PYTHONPATH": f"{plugins}:{ROOT / 'src'}", "HF_HUB_OFFLINE": "1"},
-        check=True,
-        capture_output=True,
-    )
+    named = (f"--{name}={value}" for name, value in options.items())
+    run_with_plugins(plugins, python.parent / "lerobot-eval", *named)
     metrics = json.loads((out / "eval_info.json").read_text())["per_task"][0]["metrics"]
     return list(zip(metrics["sum_rewards"], metrics["successes"], strict=True))
 
@@ -63,8 +71,15 @@ def evaluate_here() -> list[tuple[float, bool]]:
 
 
 def main() -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        theirs = evaluate_with_lerobot(Path(sys.argv[1]).absolute(), Path(folder))
+    python = Path(sys.argv[1]).absolute()
+    with tempfile.TemporaryDirectory() as name:
+        folder, plugins = Path(name), Path(name) / "plugins"
+        install = [python, "-m", "pip", "install", "-q", "--no-deps", "--target", plugins]
+        subprocess.run([*install, ROOT / "plugins"], check=True)
+        (folder / "twin").mkdir()
+        with closing(RunningTwin(TWIN, folder / "twin", 0)) as twin:
+            print(run_with_plugins(plugins, python, HERE / "lerobot_arm.py", twin.cell_file))
+        theirs = evaluate_with_lerobot(python, plugins, folder / "eval")
     here = evaluate_here()
     print(f"{'seed':>6}{'lerobot-eval':>14}{'success':>9}{'touchgoal':>11}{'success':>9}")
     for i, ((reward, success), (own, own_success)) in enumerate(zip(theirs, here, strict=True)):

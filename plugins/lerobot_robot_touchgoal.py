@@ -1,0 +1,112 @@
+"""A cell's arm in lerobot: `--robot.type=touchgoal --robot.cell=cell.toml`, inside the cell's limits."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from lerobot.robots import Robot, RobotConfig
+
+from touchgoal.control import features as ft
+from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
+from touchgoal.control.cell.connection import CellConnection, RealClock, connect_cell
+from touchgoal.control.cell.limits import cell_limits
+from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop, RunLog
+from touchgoal.control.interfaces import Actor, DriverError
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.launch.support.cell_run import check_cell
+from touchgoal.launch.support.confirm import confirm
+from touchgoal.runtime.errors import UserError
+
+
+@RobotConfig.register_subclass("touchgoal")
+@dataclass(kw_only=True)
+class TouchgoalRobotConfig(RobotConfig):
+    """Options of the robot."""
+
+    cell: str
+    """Cell file of an arm, or the cell.json of a twin."""
+    yes: bool = False
+    """Do not ask for the typed confirmation (for tests)."""
+
+
+class TouchgoalRobot(Robot):
+    """Arm, hand, cameras and fingertips of a cell; names and units are those of `control/features.py`.
+
+    Every action passes the filter and the checks of `deploy`. One that stops the arm raises DriverError;
+    connect again to go on. Send actions at `features.CONTROL_HZ`: without a new one the arm comes to rest.
+    """
+
+    config_class, name = TouchgoalRobotConfig, "touchgoal"
+
+    def __init__(self, config: TouchgoalRobotConfig) -> None:
+        super().__init__(config)
+        self._yes, self._cell = config.yes, read_cell_file(find_cell_file(Path(config.cell)))
+        if self._cell.arm == "sim":
+            raise UserError("give the cell file of an arm or of a twin, not of a simulated arm")
+        features = ft.features_of(len(cell_limits(self._cell).arm.home))
+        self._state, self._action = features[ft.STATE].names, features[ft.ACTION].names
+        self._images: dict[str, Any] = dict.fromkeys(self._cell.cameras, ft.CAMERA_SHAPE)
+        if tips := self._cell.fingertips:
+            shape = (*find_sensor(tips.sensor).image_shape, 3)
+            self._images |= dict.fromkeys(("tactile_left", "tactile_right"), shape)
+        self._connection: CellConnection | None = None
+
+    observation_features = property(lambda self: dict.fromkeys(self._state, float) | self._images)
+    action_features = property(lambda self: dict.fromkeys(self._action, float))
+    is_connected = property(lambda self: self._connection is not None)
+    is_calibrated = True
+
+    def calibrate(self) -> None:
+        """Do nothing: a cell file holds the calibration."""
+
+    configure = calibrate
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Ask the operator, connect and run `deploy`'s checks; UserError or DriverError if one fails."""
+        if not self._yes:
+            confirm(self._cell)
+        connection = connect_cell(self._cell, ft.CONTROL_HZ)
+        try:
+            with TemporaryDirectory(dir=".") as nowhere:  # lerobot records by itself
+                safety = check_cell(self._cell, connection, Path(nowhere))
+            self._loop = ControlLoop(connection, safety, True, lambda: "", lambda tick: None)
+        except BaseException:
+            connection.close()
+            raise
+        self._connection = connection
+
+    def get_observation(self) -> dict[str, Any]:
+        """Return the newest state and images."""
+        observation = self._loop.reader.read().observation
+        state = zip(self._state, observation.pop(ft.STATE).tolist(), strict=True)
+        named = {key.removeprefix(ft.IMAGE_PREFIX): value for key, value in observation.items()}
+        return {**dict(state), **{k: v for k, v in named.items() if k in self._images}}
+
+    def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+        """Run one control tick; return the action as it was done. DriverError: the arm was stopped."""
+        log, clock = RunLog(), self._connection.clock
+        wanted = np.array([float(action[name]) for name in self._action])
+        ending = self._loop.run(_OneAction(wanted), np.inf, log)
+        if ending.reason != PLAN_ENDED:
+            raise DriverError(str(ending))
+        if not isinstance(clock, RealClock):  # a lock-step twin's time goes on only so
+            clock.wait(clock.now() + 1 / ft.CONTROL_HZ)
+        return dict(zip(self._action, log.rows[-1][ft.ACTION].tolist(), strict=True))
+
+    def disconnect(self) -> None:
+        """Bring the arm to rest and release the cell."""
+        if self._connection is not None:
+            self._connection.close()
+        self._connection = None
+
+
+class _OneAction(Actor):
+    done = True
+
+    def __init__(self, action: np.ndarray) -> None:
+        self._action = action
+
+    def act(self, observation: ft.Observation) -> np.ndarray:
+        return self._action
