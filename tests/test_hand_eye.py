@@ -2,9 +2,9 @@
 
 import json
 import shutil
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -26,27 +26,22 @@ from touchgoal.sim_envs.twin.cell_task import env_config_of
 VALUES = {"pose": [1.1, 0.02, 0.5, 0.1, 0.7, -0.7, 0.1], "fovy": 41.5}
 
 
-def off(pose: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Difference in mm and degrees."""
-    D = np.linalg.inv(truth) @ pose
-    turn = np.linalg.norm(rotation_vector(D[:3, :3]))
-    return 1e3 * float(np.linalg.norm(D[:3, 3])), float(np.degrees(turn))
+def views(scene: BoardScene, joints: list[np.ndarray]) -> list[View]:
+    pictures = [scene.picture(q) for q in joints]
+    return [View(image, q, BOARD.find(image)) for image, q in zip(pictures, joints, strict=True)]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", ["wrist", "front"])
 def test_a_camera_is_found_within_a_millimetre(camera: str) -> None:
     with closing(BoardScene(camera, 480, 640)) as scene:
-        views = [
-            View(image, q, BOARD.find(image))
-            for q in postures(scene, 16, seed=0)
-            for image in [scene.picture(q)]
-        ]
-        result = calibrate_camera(views, FR3.arm, scene.on_hand)
-        mm, degrees = off(result.pose, scene.true_pose())
+        seen = views(scene, postures(scene, 16, seed=0))
+        result = calibrate_camera(seen, FR3.arm, scene.on_hand)
+        D = np.linalg.inv(scene.true_pose()) @ result.pose
+        mm, turn = 1e3 * np.linalg.norm(D[:3, 3]), np.linalg.norm(rotation_vector(D[:3, :3]))
         fovy = {"wrist": 62, "front": 40}[camera]
         focal = 240 / np.tan(np.radians(fovy / 2))
-    assert mm < 1.0 and degrees < 0.2, (mm, degrees)
+    assert mm < 1.0 and np.degrees(turn) < 0.2, (mm, turn)
     assert abs(result.lens.fy / focal - 1) < 0.003 and abs(result.lens.k1) < 0.02
     assert 1e3 * result.position_errors.mean() < 1.0 and result.pixel_error < 0.3
     assert mm < 5e3 * result.position_error  # the standard error is no boast
@@ -56,34 +51,25 @@ def test_views_that_do_not_fix_a_camera_are_refused() -> None:
     with closing(BoardScene("wrist", 480, 640)) as scene:
         [q] = postures(scene, 1, seed=0)
         about_one_axis = [q + turn * np.eye(7)[6] for turn in np.linspace(-0.3, 0.3, 8)]
-        images = [scene.picture(posture) for posture in about_one_axis]
-    views = [
-        View(image, posture, BOARD.find(image))
-        for image, posture in zip(images, about_one_axis, strict=True)
-    ]
+        seen = views(scene, about_one_axis)
     with pytest.raises(UserError, match="do not fix the camera: turn .* about two axes"):
-        calibrate_camera(views, FR3.arm, on_hand=True)
+        calibrate_camera(seen, FR3.arm, on_hand=True)
     with pytest.raises(UserError, match="3 views show the board, 6 are needed"):
-        calibrate_camera(views[:3], FR3.arm, on_hand=True)
+        calibrate_camera(seen[:3], FR3.arm, on_hand=True)
 
 
-@pytest.fixture
-def board_on_table(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    def with_board(*args: object) -> mujoco.MjSpec:
-        spec = build(*args)  # pyright: ignore[reportArgumentType]
+@pytest.mark.slow
+def test_the_command_moves_the_arm_and_writes_the_cell_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def with_board(*args: Any) -> mujoco.MjSpec:
+        spec = build(*args)
         add_board(spec, held=False)
         return spec
 
     monkeypatch.setattr(hardware, "build", with_board)
     monkeypatch.setattr("touchgoal.sim_envs.cell.in_process.STREAM_SIZE", (480, 640))
     monkeypatch.setattr("time.sleep", lambda _: None)  # simulated time need not keep pace
-    yield
-
-
-@pytest.mark.slow
-def test_the_command_moves_the_arm_and_writes_the_cell_file(
-    board_on_table: None, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
     cell_file = tmp_path / "cell.toml"
     shutil.copy(EXAMPLES / "sim.toml", cell_file)
     with closing(BoardScene("wrist", 480, 640)) as scene:

@@ -159,30 +159,24 @@ class Gripper2F85(threading.Thread):
         self.start()
 
     def run(self) -> None:
+        request = b""
         try:
             while True:
-                self._serve()
+                request += os.read(self.device, 64)
+                if len(request) >= 8 and modbus_crc(request[:-2]) == request[-2:]:
+                    self._serve(request[:-2])
+                    request = b""
         except OSError:
             pass  # unplugged
 
-    def _take(self, n: int) -> bytes:
-        data = b""
-        while len(data) < n:
-            data += os.read(self.device, n - len(data))
-        return data
-
-    def _serve(self) -> None:
-        head = self._take(6)
-        slave, code, register, count = struct.unpack(">BBHH", head)
-        body = self._take(1 + 2 * count) if code == 16 else b""
-        assert modbus_crc(head + body) == self._take(2)
+    def _serve(self, request: bytes) -> None:
+        code, register, count = struct.unpack(">xBHH", request[:6])
         if code == 16:
             assert register == 0x03E8
-            self.output = body[1:]
-            answer = head
+            answer, self.output = request[:6], request[7:]
         else:
             assert (code, register) == (4, 0x07D0)
-            answer = bytes([slave, code, 2 * count]) + self._input()
+            answer = request[:2] + bytes([2 * count]) + self._input()
         answer += modbus_crc(answer)
         if self.garble:
             self.garble -= 1
