@@ -133,10 +133,8 @@ def test_what_is_shown_live_can_be_read_live(session: list[np.ndarray]) -> None:
 def balls() -> list[np.ndarray]:
     """The measured Mini, untouched and under a ball of 4 mm, with noise of one count."""
     calibration, rng = load(GELSIGHT_MINI.sensor_file), np.random.default_rng(0)
-    flat = np.zeros((240, 320), np.float32)
-    pressed = [
-        press_surface(calibration, np.array([x, 120.0, 22.0]), 4e-3) for x in (100.0, 160.0, 220.0)
-    ]
+    flat, circles = np.zeros((240, 320), np.float32), [[x, 120.0, 22.0] for x in (100, 160, 220)]
+    pressed = [press_surface(calibration, np.array(circle), 4e-3) for circle in circles]
     clean = [shade(calibration, surface) for surface in ([flat] * 12 + pressed + [flat] * 3)]
     noisy = [picture + rng.normal(size=picture.shape) for picture in clean]
     return [picture.round().clip(0, 255).astype(np.uint8) for picture in noisy]

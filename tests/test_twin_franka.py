@@ -48,8 +48,8 @@ def moves(address: str, home: list[float]) -> dict:
     panda = refused(np.array(home) + 0.4)
     robot.joint_acceleration_limit.set([9.9, 7.5, 9.9, 9.9, 9.9, 9.9, 9.9])
 
-    def settle() -> None:
-        end = robot.state.time.to_sec() + 0.2  # the arm's time, which may be slower than the wall's
+    def settle(seconds: float = 0.2) -> None:
+        end = robot.state.time.to_sec() + seconds  # of the arm, whose time may pass more slowly
         while robot.state.time.to_sec() < end:
             time.sleep(0.01)
 
@@ -74,7 +74,7 @@ def moves(address: str, home: list[float]) -> dict:
     stiffness = np.array([600, 600, 600, 600, 250, 150, 50.0])
     with franky.JointImpedanceTracker(robot, stiffness=stiffness) as tracker:
         tracker.set_target(np.array(home), np.zeros(7))
-        time.sleep(0.5)
+        settle(0.5)
         held = float(np.abs(np.array(robot.state.q) - home).max())
     far = refused(np.array([2.9, *home[1:]]))
     ways = {"fell": fell.tolist(), "turned": turned.tolist()}
