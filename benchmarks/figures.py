@@ -122,6 +122,13 @@ def named(metrics: Metrics, **inputs: str) -> str:
     return "; ".join("{} {:.0f} % [{:.0f}, {:.0f}]".format(k, *v) for k, v in figures.items())
 
 
+def fine_tuned(metrics: Metrics, **inputs: str) -> str:
+    """Accuracy of fine-tuned networks on single touches held out, by label and input."""
+    rows = {row["input"]: row for row in metrics["rows"] if row["split"] == "sample"}
+    figures = {label: rows[name]["fine_tuned"] for label, name in inputs.items()}
+    return "; ".join("{} {:.0f} % [{:.0f}, {:.0f}]".format(k, *v) for k, v in figures.items())
+
+
 def named_by_sentences(metrics: Metrics) -> str:
     """Share of touches whose object is found by its sentences, by number of candidates; first encoder."""
     row = {key: value for key, value in metrics["rows"][0].items() if key != "encoder"}
