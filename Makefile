@@ -9,7 +9,7 @@ CODE := runtime control sim_envs episodes encoders rewards policies benchmarks l
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy maze-diffusion-policy pick-place-policy clean
+.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy maze-wrench-policy pick-place-policy clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -101,22 +101,23 @@ weights-markers: $(READY)
 	cp runs/markers/run/encoder/* encoders/weights/gelsight_mini_markers/
 
 # How a shipped policy is made anew, by one command each that says what it did (recipe.json beside the
-# weights). The maze's learns its touch encoder first; pick-and-place needs nothing for new pads. (What ships of it had other rounds, see docs/training.md.)
+# weights). The maze's baseline learns the touch encoder that both read. (What ships of pick-and-place had
+# other rounds, see docs/training.md.)
 pick-place-policy: $(READY)
 	$(BIN)/touchgoal make-policy --out runs/pick_place
 	rm -rf policies/weights/pick_place && cp -r runs/pick_place/policy/policy policies/weights/pick_place
 
 maze-policy: $(READY)
-	$(BIN)/touchgoal make-policy --task bead-maze --wrench --learn-touch --out runs/maze
+	$(BIN)/touchgoal make-policy --task bead-maze --out runs/maze
 	rm -rf policies/weights/bead_maze && cp -r runs/maze/policy/policy policies/weights/bead_maze
-	mv policies/weights/bead_maze/touch/* encoders/weights/gelsight_mini_markers_mae/
-	rmdir policies/weights/bead_maze/touch
+	rm -r policies/weights/bead_maze/touch
 
-maze-diffusion-policy: $(READY)
-	$(BIN)/touchgoal make-policy --task bead-maze --out runs/maze_diffusion
-	rm -rf policies/weights/bead_maze_diffusion
-	cp -r runs/maze_diffusion/policy/policy policies/weights/bead_maze_diffusion
-	rm -r policies/weights/bead_maze_diffusion/touch
+maze-wrench-policy: $(READY)
+	$(BIN)/touchgoal make-policy --task bead-maze --wrench --learn-touch --out runs/maze_wrench
+	rm -rf policies/weights/bead_maze_wrench
+	cp -r runs/maze_wrench/policy/policy policies/weights/bead_maze_wrench
+	mv policies/weights/bead_maze_wrench/touch/* encoders/weights/gelsight_mini_markers_mae/
+	rmdir policies/weights/bead_maze_wrench/touch
 
 $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV): about 1 GB from PyPI, 2 to 3 minutes"

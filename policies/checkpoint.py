@@ -30,9 +30,8 @@ TOUCH, ESTIMATOR = "touch", "estimator"  # folders beside a policy's weights
 _WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED_POLICIES = {"pick-place": _WEIGHTS / "pick_place", "bead-maze": _WEIGHTS / "bead_maze"}
 """The shipped policies: each is named after its task."""
-FURTHER_POLICIES = {"bead-maze-diffusion": _WEIGHTS / "bead_maze_diffusion"}
-"""Further shipped policies: the maze by diffusion on the frozen touch embedding itself, trained
-without the simulator's truth."""
+FURTHER_POLICIES = {"bead-maze-wrench": _WEIGHTS / "bead_maze_wrench"}
+"""Further shipped policies: the maze's baseline, a regression on wrenches read from the embedding."""
 POLICY_FORMAT = WeightsFormat("policy", "policy", "train one with: touchgoal train-policy")
 
 
@@ -116,7 +115,7 @@ def load_policy(name_or_path: str | Path) -> LearnedPolicy:
     """Load a policy to act with.
 
     Args:
-        name_or_path: name of a shipped policy ("pick-place", "bead-maze", "bead-maze-diffusion"),
+        name_or_path: name of a shipped policy ("pick-place", "bead-maze", "bead-maze-wrench"),
             or a folder that train-policy made.
 
     Raises:

@@ -33,7 +33,7 @@ POLICIES = {
     "shipped": "the learned policy that ships for the task",
     "pick-place": "the learned policy that ships for pick-place",
     "bead-maze": "the learned policy that ships for bead-maze",
-    "bead-maze-diffusion": "bead-maze: diffusion on the frozen touch embedding",
+    "bead-maze-wrench": "bead-maze: the baseline, a regression on wrenches read from touch",
 }
 """Names of policies, and what they are."""
 

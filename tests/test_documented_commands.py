@@ -69,7 +69,7 @@ def test_command_is_understood(
         assert not command.whole and "required" in complaint.lower(), complaint
 
 
-TARGETS = "demo weights weights-markers maze-policy maze-diffusion-policy pick-place-policy".split()
+TARGETS = "demo weights weights-markers maze-policy maze-wrench-policy pick-place-policy".split()
 
 
 @pytest.mark.parametrize("target", TARGETS)

@@ -137,7 +137,7 @@ def test_the_background_follows_the_light_and_still_reports_it() -> None:
     assert not still.drift().large
 
 
-@pytest.mark.parametrize("name", ["bead-maze", "bead-maze-diffusion"])
+@pytest.mark.parametrize("name", ["bead-maze", "bead-maze-wrench"])
 def test_shipped_policies_embed_a_touch_alike_in_another_light(name: str) -> None:
     embedder = load_policy(name).touch
     assert embedder is not None
