@@ -252,7 +252,7 @@ def test_the_films_show_the_trials(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["best.mp4", "worst.mp4"]
 
 
-def test_the_maze_by_diffusion_knows_no_truth_of_the_simulator() -> None:
-    config = load_policy("bead-maze-diffusion").config
+def test_the_shipped_maze_policy_knows_no_truth_of_the_simulator() -> None:
+    config = load_policy("bead-maze").config
     assert isinstance(config.head, DiffusionConfig)
     assert config.touch_input == "embedding" and not config.reads_wrench and not config.estimated
