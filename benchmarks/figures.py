@@ -103,13 +103,14 @@ def nearest(metrics: Metrics) -> str:
     return "; ".join(rows)
 
 
-def retrieved(metrics: Metrics) -> str:
-    """Mean average precision from touch to text of the first encoder, by split, beside chance."""
+def retrieved(metrics: Metrics, row: str = "") -> str:
+    """Mean average precision from touch to text of a row or the first encoder, by split, beside chance."""
     parts = []
     for split in dict.fromkeys(row["split"] for row in metrics["rows"]):
-        rows = [row for row in metrics["rows"] if row["split"] == split]
-        chance = next(row for row in rows if row["row"] == "chance")["touch to text"][0]
-        own = next(row for row in rows if row["row"] not in ("chance", "raw pixels"))
+        rows = [r for r in metrics["rows"] if r["split"] == split]
+        chance = next(r for r in rows if r["row"] == "chance")["touch to text"][0]
+        encoders = [r for r in rows if r["row"] not in ("chance", "raw pixels")]
+        own = next(r for r in encoders if row in ("", r["row"]))
         figure = "{:.1f} [{:.1f}, {:.1f}]".format(*own["touch to text"])
         parts.append(f"{split} {figure} (chance {chance:.1f})")
     return "; ".join(parts)
