@@ -56,7 +56,7 @@ _WRITE_ERRORS = {  # errno -> advice
 
 def usage() -> str:
     """Return the text of `touchgoal --help`."""
-    lines = [f"  {name:<20}{meaning}" for name, meaning in COMMANDS.items()]
+    lines = [f"  {name:<22}{meaning}" for name, meaning in COMMANDS.items()]
     return (
         "usage: touchgoal COMMAND [options]\n       touchgoal COMMAND --help\n"
         "       touchgoal --version\n\ncommands:\n" + "\n".join(lines)
