@@ -35,7 +35,7 @@ def s3_server(root: Path) -> Iterator[S3Server]:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: S3Server
+    server: S3Server  # pyright: ignore[reportIncompatibleVariableOverride]  # its only server
     protocol_version = "HTTP/1.1"
 
     def do_HEAD(self) -> None:

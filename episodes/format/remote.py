@@ -104,7 +104,7 @@ def _delete_outdated(root: Path, files: dict[str, fs.FileInfo]) -> None:
         name = path.relative_to(root).as_posix()
         there, here = files.get(name), path.stat()
         same = there and (here.st_size, int(here.st_mtime)) == (there.size, _seconds(there))
-        if not same or (there.mtime is None and name.startswith("meta/")):
+        if not (there and same) or (there.mtime is None and name.startswith("meta/")):
             path.unlink(missing_ok=True)
 
 
