@@ -106,7 +106,7 @@ def nearest(metrics: Metrics) -> str:
 def retrieved(metrics: Metrics, row: str = "") -> str:
     """Mean average precision from touch to text of a row or the first encoder, by split, beside chance."""
     parts = []
-    for split in dict.fromkeys(row["split"] for row in metrics["rows"]):
+    for split in dict.fromkeys(r["split"] for r in metrics["rows"]):
         rows = [r for r in metrics["rows"] if r["split"] == split]
         chance = next(r for r in rows if r["row"] == "chance")["touch to text"][0]
         encoders = [r for r in rows if r["row"] not in ("chance", "raw pixels")]
@@ -116,17 +116,10 @@ def retrieved(metrics: Metrics, row: str = "") -> str:
     return "; ".join(parts)
 
 
-def named(metrics: Metrics, **inputs: str) -> str:
-    """Accuracy of the linear probe on whole visits held out, by label and input."""
-    rows = {row["input"]: row for row in metrics["rows"] if row["split"] == "press"}
-    figures = {label: rows[name]["probe"] for label, name in inputs.items()}
-    return "; ".join("{} {:.0f} % [{:.0f}, {:.0f}]".format(k, *v) for k, v in figures.items())
-
-
-def fine_tuned(metrics: Metrics, **inputs: str) -> str:
-    """Accuracy of fine-tuned networks on single touches held out, by label and input."""
-    rows = {row["input"]: row for row in metrics["rows"] if row["split"] == "sample"}
-    figures = {label: rows[name]["fine_tuned"] for label, name in inputs.items()}
+def named(metrics: Metrics, split: str = "press", column: str = "probe", **inputs: str) -> str:
+    """Accuracy of the linear probe, or another column, on what a split holds out, by label and input."""
+    rows = {row["input"]: row for row in metrics["rows"] if row["split"] == split}
+    figures = {label: rows[name][column] for label, name in inputs.items()}
     return "; ".join("{} {:.0f} % [{:.0f}, {:.0f}]".format(k, *v) for k, v in figures.items())
 
 

@@ -25,6 +25,9 @@ _DEPLOYED = shlex.split(  # delays wider than measured on the wire: see `Deploym
 )
 # The policy is trained on the simulator's truth, so these episodes need no images.
 _NO_IMAGES = ["--env.no-tactile", "--env.cameras"]
+_ONLY_FOR = dict.fromkeys(("touch", "learn_touch", "wrench"), "bead-maze") | {
+    "estimator": "pick-place"
+}
 _REGRESSION = ["--head", "regression"]
 # Denoising steps: one of five. Further steps, and fresh noise at every plan, make successive plans
 # disagree. On 40 validation wires a U-Net led 33 beads to the end, this perceptron 37 and, from another
@@ -86,19 +89,10 @@ def main(config: Config) -> None:
 
     if config.learn_touch and config.touch:
         raise UserError("--learn-touch and --touch exclude each other: leave out one")
-    other_task = (
-        [config.estimator and "--estimator"]
-        if config.task == "bead-maze"
-        else [
-            config.touch and "--touch",
-            config.learn_touch and "--learn-touch",
-            config.wrench and "--wrench",
-        ]
-    )
-    for option in filter(None, other_task):
-        raise UserError(
-            f"{option} is not for {config.task}: leave it out, or choose the other --task"
-        )
+    for name, task in _ONLY_FOR.items():
+        if getattr(config, name) and config.task != task:
+            option = f"--{name.replace('_', '-')}"
+            raise UserError(f"{option} is for {task}: leave it out, or add --task {task}")
     if config.resume and config.out is None:
         raise UserError("to go on with a run, name its folder with --out")
     steps_of = _pick_place if config.task == "pick-place" else _bead_maze

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.ssl import config as ssl
-from touchgoal.encoders.training.options import TrainerOptions
+from touchgoal.encoders.training.options import SetTrainerOptions
 from touchgoal.launch.support.align_options import Align, Preset, presets
 from touchgoal.runtime.option_types import (
     RARE,
@@ -35,7 +35,7 @@ class _UnlabelledData:
 
 
 @checked_dataclass
-class _Unlabelled(TrainerOptions, _UnlabelledData):
+class _Unlabelled(SetTrainerOptions, _UnlabelledData):
     """Options of every training without labels."""
 
     preset: Preset = "default"

@@ -84,8 +84,8 @@ class Config(TrainingOptions):
     share: Annotated[Fraction, RARE] = 1.0
     """Share of the episodes to train on, counted from the first."""
     head: Head = "small"
-    """Denoiser of a diffusion policy: a U-Net (tiny, small, published) or an mlp, which learns in a
-    fifth of the time; or regression, which predicts plans directly."""
+    """Denoiser of a diffusion policy: a U-Net (tiny, small, published) or a multilayer
+    perceptron (mlp), which trains faster; or regression, which predicts plans directly."""
     representation: ActionRepresentation = "body_twist"
     """Actions as the network predicts them: delta (joint change of each control tick), relative
     (joint change since the plan's start), absolute (joint positions), base_twist or body_twist

@@ -36,7 +36,7 @@ def main(config: Config) -> None:
     import torch
 
     from touchgoal.control import features as ft
-    from touchgoal.encoders.training.run import check_training, open_training
+    from touchgoal.encoders.training.run import check_run, open_training
     from touchgoal.encoders.training.trainer import is_first_process
     from touchgoal.policies.perception.placements import render_placements
     from touchgoal.policies.perception.pose_estimator import PoseEstimator
@@ -46,7 +46,7 @@ def main(config: Config) -> None:
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.provenance import provenance
 
-    check_training(config, config.out)
+    check_run(config, config.out)
     first_seed = seeds.POSE_TRAINING.first(config.objects, "--objects")
     out = open_training(config, "train-pose-estimator")
     torch.manual_seed(config.seed)

@@ -3,40 +3,25 @@
 import base64
 import hashlib
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
+
+from local_server import LocalHandler, LocalServer
 
 TOKEN = "hf_local"
 
 
-class HubServer(ThreadingHTTPServer):
+class HubServer(LocalServer):
     """Repositories are dictionaries of files; those named in `private` need the token to read, too."""
 
     def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), _Handler)
+        super().__init__(_Handler)
         self.repositories: dict[str, dict[str, bytes]] = {}
         self.private: set[str] = set()
         self.large: dict[str, bytes] = {}  # by SHA-256, on their way to a commit
         self.commits = 0
 
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}"
 
-
-@contextmanager
-def running_hub() -> Iterator[HubServer]:
-    with HubServer() as server:
-        Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-        yield server
-        server.shutdown()
-
-
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(LocalHandler):
     server: HubServer  # pyright: ignore[reportIncompatibleVariableOverride]
-    protocol_version = "HTTP/1.1"
 
     def do_GET(self) -> None:
         path = self.path.partition("?")[0]
@@ -47,18 +32,18 @@ class _Handler(BaseHTTPRequestHandler):
                 self._answer({"id": name, "sha": self._commit, "siblings": siblings})
             return
         if "/resolve/" not in path:  # what the client asks beside, such as news of itself
-            self._send(404, b"")
+            self.send(404, b"")
             return
         owner, name, _, _, file = path[1:].split("/", 4)
         if (files := self._readable(f"{owner}/{name}")) is not None:
-            self._send(200, files[file], {"ETag": hashlib.sha256(files[file]).hexdigest()})
+            self.send(200, files[file], {"ETag": hashlib.sha256(files[file]).hexdigest()})
 
     do_HEAD = do_GET
 
     def do_PUT(self) -> None:
         content = self._body()
         self.server.large[hashlib.sha256(content).hexdigest()] = content
-        self._send(200, b"")
+        self.send(200, b"")
 
     def do_POST(self) -> None:
         body, path = self._body(), self.path.partition("?")[0]
@@ -82,7 +67,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif path == "/api/validate-yaml":  # of the card
             self._answer({"errors": [], "warnings": []})
         else:
-            self._send(404, b"")
+            self.send(404, b"")
 
     def _create(self, wanted: dict) -> None:
         name = f"{wanted['organization']}/{wanted['name']}"
@@ -114,7 +99,7 @@ class _Handler(BaseHTTPRequestHandler):
         """The files, or None after an answer that says why not, as the Hub's."""
         files = self.server.repositories.get(name)
         if files is None or (name in self.server.private and not self._authorised()):
-            self._send(404, b"{}", {"X-Error-Code": "RepoNotFound"})
+            self.send(404, b"{}", {"X-Error-Code": "RepoNotFound"})
             return None
         return files
 
@@ -122,19 +107,10 @@ class _Handler(BaseHTTPRequestHandler):
         return self.rfile.read(int(self.headers["Content-Length"] or 0))
 
     def _answer(self, value: dict, status: int = 200) -> None:
-        self._send(status, json.dumps(value).encode(), {"Content-Type": "application/json"})
+        self.send(status, json.dumps(value).encode(), {"Content-Type": "application/json"})
 
-    def _send(self, status: int, content: bytes, headers: dict[str, str] | None = None) -> None:
-        self.send_response(status)
-        for name, value in {"X-Repo-Commit": self._commit, **(headers or {})}.items():
-            self.send_header(name, value)
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(content)
-
-    def log_message(self, format: str, *args: object) -> None:
-        pass
+    def send(self, status: int, content: bytes, headers: dict[str, str] | None = None) -> None:
+        super().send(status, content, {"X-Repo-Commit": self._commit, **(headers or {})})
 
 
 def _mode(path: str) -> dict[str, object]:

@@ -1,42 +1,24 @@
 """A server on this machine that answers what an S3 client asks when it lists and reads."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from email.utils import formatdate
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 from urllib.parse import parse_qs, unquote, urlsplit
 from xml.sax.saxutils import escape
 
+from local_server import LocalHandler, LocalServer
 
-class S3Server(ThreadingHTTPServer):
+
+class S3Server(LocalServer):
     """Buckets are the folders of `root`; `read` lists the files that were fetched, in order."""
 
     def __init__(self, root: Path) -> None:
-        super().__init__(("127.0.0.1", 0), _Handler)
+        super().__init__(_Handler)
         self.root, self.read = root, list[str]()
 
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}"
 
-
-@contextmanager
-def s3_server(root: Path) -> Iterator[S3Server]:
-    server = S3Server(root)
-    Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield server
-    finally:
-        server.shutdown()
-        server.server_close()
-
-
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(LocalHandler):
     server: S3Server  # pyright: ignore[reportIncompatibleVariableOverride]  # its only server
-    protocol_version = "HTTP/1.1"
 
     def do_HEAD(self) -> None:
         self.do_GET()
@@ -45,7 +27,7 @@ class _Handler(BaseHTTPRequestHandler):
         address = urlsplit(self.path)
         bucket, _, key = unquote(address.path).strip("/").partition("/")
         if not (self.server.root / bucket).is_dir():
-            self._send(404, _error("NoSuchBucket", "The specified bucket does not exist"))
+            self.send(404, _error("NoSuchBucket", "The specified bucket does not exist"))
         elif "list-type=2" in address.query:
             self._list(bucket, parse_qs(address.query).get("prefix", [""])[0])
         elif (path := self.server.root / bucket / key).is_file():
@@ -53,7 +35,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.server.read.append(key)
             self._send_file(path)
         else:
-            self._send(404, _error("NoSuchKey", "The specified key does not exist"))
+            self.send(404, _error("NoSuchKey", "The specified key does not exist"))
 
     def _list(self, bucket: str, prefix: str) -> None:
         folder = self.server.root / bucket
@@ -65,7 +47,7 @@ class _Handler(BaseHTTPRequestHandler):
             if name.startswith(prefix)
         )
         head = f"<Name>{bucket}</Name><Prefix>{escape(prefix)}</Prefix><IsTruncated>false</IsTruncated>"
-        self._send(200, f"<ListBucketResult>{head}{rows}</ListBucketResult>".encode())
+        self.send(200, f"<ListBucketResult>{head}{rows}</ListBucketResult>".encode())
 
     def _send_file(self, path: Path) -> None:
         data = path.read_bytes()
@@ -74,19 +56,7 @@ class _Handler(BaseHTTPRequestHandler):
         there = f"bytes {first}-{int(first) + len(part) - 1}/{len(data)}"
         modified = formatdate(path.stat().st_mtime, usegmt=True)
         headers = {"Content-Range": there, "Last-Modified": modified}
-        self._send(206 if "Range" in self.headers else 200, part, headers)
-
-    def _send(self, status: int, content: bytes, headers: dict[str, str] | None = None) -> None:
-        self.send_response(status)
-        for name, value in (headers or {}).items():
-            self.send_header(name, value)
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(content)
-
-    def log_message(self, format: str, *args: object) -> None:
-        pass
+        self.send(206 if "Range" in self.headers else 200, part, headers)
 
 
 def _iso(path: Path) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hub_server import TOKEN, HubServer, running_hub
+from hub_server import TOKEN, HubServer
 from huggingface_hub import HfApi, constants
 
 from touchgoal.encoders.hub.repository import pulled, push
@@ -28,7 +28,7 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)  # a protocol of the real hub's own
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)  # conftest.py's, for all other tests
     monkeypatch.setattr(constants, "HF_TOKEN_PATH", "/nonexistent")
-    with running_hub() as server:
+    with HubServer().running() as server:
         yield server
 
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from lerobot_layout import write_lerobot_set
-from s3_server import S3Server, s3_server
+from s3_server import S3Server
 from test_lerobot_sets import arm_frames
 from toy_episodes import make_episode
 
@@ -31,7 +31,7 @@ def s3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
     for i in range(3):
         writer.append(make_episode(seed=i))
     writer.close()
-    with s3_server(tmp_path / "s3") as server:
+    with S3Server(tmp_path / "s3").running() as server:
         for name, value in {
             "AWS_ENDPOINT_URL": server.url,
             "AWS_ACCESS_KEY_ID": "key",

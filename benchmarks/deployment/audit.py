@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.benchmarks.deployment.robustness import deployed_task
-from touchgoal.benchmarks.deployment.trials import TABLE_HEAD, TrialOptions, table_row
+from touchgoal.benchmarks.deployment.trials import TABLE_HEAD, UNCHANGED, DeployedOptions, table_row
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.episodes.recording import Actor, EpisodeSpec
@@ -20,19 +19,12 @@ from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trial,
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.runtime.progress import track
 from touchgoal.runtime.worker_pool import one_core_workers
-from touchgoal.sim_envs.config import ENVS, TaskConfig, TaskName
-
-UNCHANGED = "as it is"
+from touchgoal.sim_envs.config import TaskConfig
 
 
 @checked_dataclass
-class Config(TrialOptions):
+class Config(DeployedOptions):
     """Options of benchmark audit."""
-
-    tasks: tuple[TaskName, ...] = tuple(ENVS)
-    """Tasks; the maze is on test wires."""
-    as_deployed: bool = True
-    """Let the arm behave as deployed."""
 
 
 @dataclass
@@ -65,7 +57,7 @@ def run(config: Config) -> dict[str, Any]:
     """Return success by task and replaced input, with the trials."""
     lines, rows = [TABLE_HEAD], []
     for task in config.tasks:
-        maker, env = prepare_policy(config.policy, deployed_task(task, config.as_deployed))
+        maker, env = prepare_policy(config.policy, config.environment(task))
         specs = trial_specs(env, config.episodes + 1, config.seed)
         audit = partial(_audit, env, maker)
         with one_core_workers(min(config.workers, config.episodes)) as pool:

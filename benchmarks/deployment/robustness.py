@@ -7,10 +7,10 @@ it: `--policy expert`, `--policy follower`.
 from dataclasses import replace
 from typing import Any
 
-from touchgoal.benchmarks.deployment.trials import TrialOptions, try_cases
+from touchgoal.benchmarks.deployment.trials import UNCHANGED, DeployedOptions, try_cases
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
-from touchgoal.sim_envs.config import ENVS, BeadMazeConfig, TaskConfig, TaskName
+from touchgoal.sim_envs.config import TaskConfig, TaskName
 from touchgoal.sim_envs.scene.wires import HELD_OUT
 
 _LIGHT = {
@@ -38,19 +38,14 @@ _CHANGES: dict[TaskName, dict[str, dict[str, Any]]] = {
         "a family of wires never trained on": {"families": (HELD_OUT,)},
     },
 }
-UNCHANGED = "unchanged"
 
 
 @checked_dataclass
-class Config(TrialOptions):
+class Config(DeployedOptions):
     """Options of benchmark robustness."""
 
-    tasks: tuple[TaskName, ...] = tuple(ENVS)
-    """Tasks; the maze is on test wires."""
     changes: tuple[str, ...] = ()
     """Changes to try, such as "light -15%"; default: all of the task, and none."""
-    as_deployed: bool = True
-    """Let the arm behave as deployed."""
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -68,18 +63,10 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _environments(config: Config, task: TaskName) -> dict[str, TaskConfig]:
-    base = deployed_task(task, config.as_deployed)
+    base = config.environment(task)
     late = {
         name: replace(base, deployment=replace(base.deployment, **change))
         for name, change in (_DELAYED | _FROZEN).items()
     }
     changed = {name: replace(base, **change) for name, change in _CHANGES[task].items()}
     return {UNCHANGED: base, **changed, **late}
-
-
-def deployed_task(task: TaskName, as_deployed: bool) -> TaskConfig:
-    """Return a task's options for tests: the maze's test wires, the hand up to 10 degrees askew."""
-    base = replace(ENVS[task], as_deployed=as_deployed)
-    if isinstance(base, BeadMazeConfig):
-        return replace(base, split="test", start_angle=10.0)
-    return base

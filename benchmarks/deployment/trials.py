@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,9 @@ from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.policies.evaluation.evaluate import Evaluation, evaluate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
-from touchgoal.sim_envs.config import TaskConfig
+from touchgoal.sim_envs.config import ENVS, BeadMazeConfig, TaskConfig, TaskName
 
+UNCHANGED = "unchanged"  # row of a table
 TABLE_HEAD = f"{'':<46}{'success [95 % Wilson]':<24}{'peak force N, mean':>19}{'sd':>6}{'max':>6}"
 
 
@@ -28,6 +29,23 @@ class TrialOptions(BenchmarkOptions):
     """Random seed of the first episode; each further one adds one."""
     workers: Count = CORES
     """Processes that simulate."""
+
+
+@checked_dataclass
+class DeployedOptions(TrialOptions):
+    """Options of a benchmark that tries a policy in several tasks, as deployed."""
+
+    tasks: tuple[TaskName, ...] = tuple(ENVS)
+    """Tasks; the maze is on test wires."""
+    as_deployed: bool = True
+    """Let the arm behave as deployed."""
+
+    def environment(self, task: TaskName) -> TaskConfig:
+        """Return a task's options: of the maze test wires, the hand up to 10 degrees askew."""
+        base = replace(ENVS[task], as_deployed=self.as_deployed)
+        if isinstance(base, BeadMazeConfig):
+            return replace(base, split="test", start_angle=10.0)
+        return base
 
 
 def try_cases(config: TrialOptions, cases: Iterable[tuple[str, TaskConfig]]) -> dict[str, Any]:

@@ -22,6 +22,12 @@ class TrainerOptions:
     CPU without AVX-512 is 20 times slower with it."""
     resume: bool = False
     """Continue the run in --out after its last finished epoch."""
+
+
+@checked_dataclass
+class SetTrainerOptions(TrainerOptions):
+    """Options of a training on episode sets."""
+
     keys: Annotated[tuple[str, ...], RARE] = ()
     """Keys of a LeRobot set whose features have other names: STORED=KEY, such as
     observation.images.top=observation.images.front."""
@@ -40,5 +46,5 @@ class DataOptions:
 
 
 @checked_dataclass
-class TrainingOptions(TrainerOptions, DataOptions):
+class TrainingOptions(SetTrainerOptions, DataOptions):
     """Options of every training on episodes; `--help` lists those of the last base first."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.encoders.training.checkpoint import check_run_folder
-from touchgoal.encoders.training.options import TrainerOptions
+from touchgoal.encoders.training.options import SetTrainerOptions, TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.keys import use_keys
 from touchgoal.episodes.overlap import require_no_shared_frames
@@ -15,20 +15,24 @@ from touchgoal.runtime.provenance import provenance
 from touchgoal.runtime.run_folder import open_run
 
 
-def check_training(options: TrainerOptions, out: Path | None, first: str = "") -> None:
+def check_training(options: SetTrainerOptions, out: Path | None) -> None:
     """Check the options of a training before data are read, and apply --keys to all later sets.
 
-    `first` is the subfolder of the first training. UserError: no such device, malformed keys, an
-    unfit folder, or no folder where one is needed.
+    UserError: malformed keys, or as for `check_run`.
     """
-    check_device(options.device)
     use_keys(options.keys)
+    check_run(options, out)
+
+
+def check_run(options: TrainerOptions, out: Path | None) -> None:
+    """Check device and folder; UserError: no such device, an unfit folder, none where one is needed."""
+    check_device(options.device)
     if out is None and options.resume:
         raise UserError("to resume a run, name its folder with --out")
     if out is None and int(os.environ.get("WORLD_SIZE", 1)) > 1:
         raise UserError("several processes need one folder: name it with --out")
     if out is not None:
-        check_run_folder(out / first, options.resume)
+        check_run_folder(out, options.resume)
 
 
 def check_one_process(method: str) -> None:

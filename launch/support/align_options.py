@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig, Split
-from touchgoal.encoders.training.options import TrainerOptions
+from touchgoal.encoders.training.options import SetTrainerOptions
 from touchgoal.runtime.option_types import RARE, Count, CountOrNone, checked_dataclass
 
 Preset = Literal["default", "paper"]
@@ -17,7 +17,7 @@ def presets(option: str, configs: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 @checked_dataclass
-class Align(TrainerOptions):
+class Align(SetTrainerOptions):
     """Align touch with frozen image and text networks by contrastive learning, as in MMWand."""
 
     PRESETS: ClassVar = presets("align", ALIGN_PRESETS)
