@@ -35,7 +35,7 @@ def draw(curves: Curves, gamma: float) -> Figure:
         ),
         ("state reward\n= -cost", {name: curves.rewards[name] for name in rewarded}),
         (
-            f"potential-based reward\nγ = {gamma:g} a second",
+            f"potential-based reward\nγ = {gamma:g} per second",
             {name: curves.potential_rewards(gamma)[name] for name in rewarded},
         ),
     )
