@@ -19,7 +19,7 @@ from visgel_scenes import (
 )
 
 from touchgoal.encoders.annotation.annotate import annotate_all
-from touchgoal.encoders.annotation.boxes import iou, square_crop
+from touchgoal.encoders.annotation.boxes import iou
 from touchgoal.encoders.annotation.config import AnnotationSettings
 from touchgoal.encoders.annotation.frame_matching import match_contact, match_reference
 from touchgoal.encoders.annotation.records import AnnotatedTouch, LeftOut, read_annotations
@@ -138,18 +138,6 @@ def test_killed_and_resumed_ends_the_same(
         twenty.annotate(tmp_path, third)
 
 
-def test_broken_lines_are_named(annotated: tuple, tmp_path: Path) -> None:
-    text = (annotated[0] / "annotations.jsonl").read_text().splitlines()
-    record = json.loads(text[1])
-    broken = {"Invalid JSON": text[1][:50], "touched is 9": json.dumps(record | {"touched": 9})}
-    for message, line in broken.items():
-        path = tmp_path / "annotations.jsonl"
-        path.write_text("\n".join([text[0], line, *text[2:]]))
-        with pytest.raises(UserError, match=rf"annotations.jsonl:2: .*{message}") as error:
-            read_annotations(path)
-        assert "\n" not in str(error.value)
-
-
 def test_lists_of_both_directions(tmp_path: Path) -> None:
     def paths(kind: str, *frames: int) -> list[str]:
         return [f"data/data_seen/images/{kind}/0/rec_00000/frame{i}.jpg" for i in frames]
@@ -231,13 +219,6 @@ def test_annotations_become_touches_that_align_trains_on(annotated: tuple, tmp_p
     assert (tmp_path / "run" / "encoder").is_dir()
 
 
-def test_crop_keeps_its_shape_in_a_grey_square() -> None:
-    image = np.full((100, 100, 3), 200, np.uint8)
-    square = square_crop(image, (-20.0, 40.0, 100.0, 60.0), 50)
-    assert (square[20:30] == 200).all()
-    assert (square[:19] == 128).all() and (square[31:] == 128).all()
-
-
 def test_command_with_real_classes(
     twenty: Set, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -260,16 +241,3 @@ def test_command_with_real_classes(
         assert all("What specific" not in i.caption for i in record.instances)
     for reason in metrics["left_out"]:
         assert reason in printed
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [("--sensor-box 9 9 1 1", "left, top, right and bottom"), ("--root .", "--root")],
-)
-def test_bad_input_is_one_line(
-    options: str, message: str, twenty: Set, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["annotate", str(twenty.list), *options.split(), "--out", str(tmp_path / "out")])
-    assert message in f"{stop.value.code} {capsys.readouterr().err}"
-    assert not (tmp_path / "out").exists()

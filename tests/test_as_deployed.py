@@ -10,7 +10,7 @@ import torch
 
 from touchgoal.control import features as ft
 from touchgoal.control.safety.limits import TASK_FORCES
-from touchgoal.policies.perception.proprioception import network_input, tare
+from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench
 from touchgoal.sim_envs.config import BeadMazeConfig, DeploymentConfig, PickPlaceConfig
@@ -120,11 +120,6 @@ def test_an_estimated_wrench_is_biased_and_noisy() -> None:
         means.append(settled.mean(0) - true)
         assert 0.01 < settled[:, 0].std() < 1.5
     assert 0.5 < np.std(means, axis=0)[0] < 1.5 and np.abs(np.mean(means, axis=0)[0]) < 0.5
-
-
-def test_taring_takes_the_bias() -> None:
-    first = np.array([1.0, 2, 3, 0.1, 0.2, 0.3], np.float32)
-    assert np.allclose(tare(np.stack([first, first + 1]), first), [[0.0] * 6, [1.0] * 6])
 
 
 def test_a_policy_that_sees_commands_sees_no_delay() -> None:

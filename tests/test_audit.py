@@ -3,13 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from touchgoal.rewards.audit import REPLACEMENTS, audit_touch
 from touchgoal.rewards.curves import Contact, Curves
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
-from touchgoal.runtime.errors import UserError
 
 RNG = np.random.default_rng(0)
 NAMES = ("ball", "brick", "can")
@@ -69,12 +67,3 @@ def test_the_verdict_is_yes_where_touch_tells_and_no_where_it_was_shuffled() -> 
     shuffled_episodes = [shuffled(e) for e in episodes]
     audit = audit_touch(shuffled_episodes, goals, measure)
     assert not audit.mattered and "no sign that touch mattered" in audit.table
-
-
-def test_what_cannot_be_audited_is_refused() -> None:
-    one = episode(0)
-    with pytest.raises(UserError, match="at least two episodes"):
-        audit_touch([one], [goal(one)], measure)
-    own = replace(goal(one), same_episode=frozenset({"tactile"}))
-    with pytest.raises(UserError, match="is a frame of itself"):
-        audit_touch([one, one], [own, own], measure)

@@ -10,7 +10,6 @@ from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.control.tactile.contact import THRESHOLD, contact_strength
 from touchgoal.episodes.recording import run
-from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze, add_bead_on_wire, add_wire
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
@@ -178,12 +177,3 @@ def test_bead_stays_on_the_wire_whatever_the_hand_does(maze: BeadMaze) -> None:
         point, _ = maze.wire.at(maze.wire.project(maze.object_pose()[:3], maze.arc_length))
         assert np.linalg.norm(maze.object_pose()[:3] - point) < 2e-3
     assert pressed
-
-
-def test_bad_requests_say_what_to_do(maze: BeadMaze) -> None:
-    with pytest.raises(UserError, match="unknown wire 'knot-1'; a wire is FAMILY-SEED"):
-        maze.reset(options={"wire": "knot-1"})
-    with pytest.raises(UserError, match="makes no sound wire"):
-        find(next(f"roller-{i}" for i in range(100) if wires.make("roller", i) is None))
-    with pytest.raises(UserError, match="there are 20 validation wires per family"):
-        choose("validation", 100)

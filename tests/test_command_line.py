@@ -14,7 +14,6 @@ from typing import Any
 
 import pytest
 
-import touchgoal
 from touchgoal import __version__
 from touchgoal.launch.__main__ import COMMANDS, main
 from touchgoal.launch.list import KINDS
@@ -79,19 +78,6 @@ def test_help_shows_the_first_options_and_help_all_shows_all(capsys: pytest.Capt
     assert "--env.timestep" in capsys.readouterr().out
 
 
-def test_help_joins_paragraphs_and_says_defaults(capsys: pytest.CaptureFixture) -> None:
-    with pytest.raises(SystemExit):
-        main(["fit-normalizer", "--help"])
-    printed = capsys.readouterr().out
-    assert "With --value it also" in " ".join(printed.split())
-    assert not any(line.startswith("--value") for line in printed.splitlines())
-    assert "1 more option, rarely needed" in printed and "(default: )" not in printed
-    for name, dated in (("reward-curves", True), ("pull", False)):  # which says its own default
-        with pytest.raises(SystemExit):
-            main([name, "--help"])
-        assert ("runs/<date>_<command>" in capsys.readouterr().out) == dated
-
-
 def test_a_mistyped_option_or_command_is_guessed(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit):
         options("--env.mas", "1", "2")
@@ -109,18 +95,6 @@ def test_version_and_lists(capsys: pytest.CaptureFixture) -> None:
         main(["list", kind])
         printed = capsys.readouterr().out.splitlines()
         assert [line.split()[0] for line in printed] == list(entries()) != []
-
-
-def test_the_interface_alone_is_listed() -> None:
-    names = [name for name in dir(touchgoal) if not name.startswith("_")]
-    wanted = "evaluate load_encoder load_episodes load_policy make make_vec reward_curve"
-    assert names == wanted.split()
-
-
-def test_completion(capsys: pytest.CaptureFixture) -> None:
-    main(["completion", "bash"])
-    script = capsys.readouterr().out
-    assert "complete -F" in script and all(name in script for name in COMMANDS)
 
 
 def test_out_is_probed_before_any_work(tmp_path: Path) -> None:
@@ -272,9 +246,3 @@ def test_a_value_out_of_range_is_one_line(
     with pytest.raises(OptionError, match=f"^{config.__name__}: {message}") as refused:
         config(**values)
     assert "\n" not in str(refused.value)
-
-
-def test_named_wires_are_taken_in_turn() -> None:
-    config = BeadMazeConfig(wires=("helix-1", "arc-2000009"))
-    assert [w.name for w in config.chosen_wires(3)] == ["helix-1", "arc-2000009", "helix-1"]
-    assert len(BeadMazeConfig(split="validation").chosen_wires()) == 80  # all there are

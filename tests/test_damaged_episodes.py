@@ -133,14 +133,6 @@ def test_a_set_of_an_older_version_is_read_and_continued(small: Path) -> None:
     assert validate(small) == [] and "pix_fmt" not in (small / set_files.INFO).read_text()
 
 
-def test_statistics_that_are_none_of_the_frames_are_noticed(small: Path) -> None:
-    stats = json.loads((small / set_files.STATS).read_text())
-    stats[ft.STATE]["mean"] = [999.0] * 15
-    (small / set_files.STATS).write_text(json.dumps(stats))
-    assert any(set_files.STATS in problem for problem in validate(small))
-    assert repair(small) and validate(small) == []
-
-
 def test_pictures_and_json_that_are_traps_are_one_line(tmp_path: Path, small: Path) -> None:
     """A PNG of 50,000 squared in 60 bytes, lengths that cannot be, JSON a hundred thousand deep."""
     chunk = b"IHDR" + struct.pack(">IIBBBBB", 50_000, 50_000, 8, 2, 0, 0, 0)

@@ -266,19 +266,6 @@ def test_video_and_folder_give_the_same_frames(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read, frames)
 
 
-def test_unreadable_media(tmp_path: Path) -> None:
-    (tmp_path / "broken.mp4").write_bytes(b"\0" * 500)
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "mixed").mkdir()
-    for i in (1, 2):
-        cv2.imwrite(str(tmp_path / "mixed" / f"{i}.png"), np.zeros((8 * i, 8, 3), np.uint8))
-    for name in ("broken.mp4", "empty", "mixed", "absent.mp4"):
-        with pytest.raises(UserError, match=name):
-            read_frames(tmp_path / name)
-    with pytest.raises(UserError, match="even height"):
-        write_video(tmp_path / "odd.mp4", np.zeros((2, 7, 8, 3), np.uint8), 20)
-
-
 def test_an_append_rewrites_the_last_file_of_the_episodes_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

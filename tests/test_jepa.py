@@ -136,16 +136,6 @@ def test_what_is_hidden_reaches_the_targets_alone(method: Method) -> None:
     torch.testing.assert_close(after, before)
 
 
-def test_the_predictor_is_told_where() -> None:
-    model = build("vjepa")
-    assert len(model.predictor.places) == 24 and len(model.predictor.places.unique(dim=0)) == 24
-    seen, ids = torch.randn(1, 3, 48, generator=rng()), torch.tensor([[0, 1, 13]])
-    here, there = (model.predictor(seen, ids, torch.tensor([[k]])) for k in (2, 14))
-    assert not torch.allclose(here, there, atol=1e-3)
-    moved = model.predictor(seen, torch.tensor([[4, 1, 13]]), torch.tensor([[2]]))
-    assert not torch.allclose(here, moved, atol=1e-4)
-
-
 @pytest.mark.parametrize(
     "config",
     [MAE, replace(MAE, bottleneck=False), replace(MAE, stacked=True), DINO, ITOY, VTOY],

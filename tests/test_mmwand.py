@@ -6,15 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from in_process import in_process_workers
 
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet
-from touchgoal.benchmarks.papers.mmwand.grasped_objects import _hits
 from touchgoal.benchmarks.papers.mmwand.retrieval import PUBLISHED, judge
 from touchgoal.control import features as ft
-from touchgoal.encoders.alignment.config import HeadsConfig
-from touchgoal.encoders.alignment.heads import PairedEmbeddings, fit_heads
 from touchgoal.encoders.alignment.splits import SPLITS, Fold, split_touches
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
@@ -96,24 +92,6 @@ def test_retrieval_knows_the_right_answer_and_chance() -> None:
         assert 0.1 < precision.mean() < 0.19, direction
 
 
-def test_heads_bring_words_and_pictures_to_touch() -> None:
-    data = made_up()
-    touch = F.normalize(torch.from_numpy(data.touch["touch"]), dim=1)
-    rows = (torch.from_numpy(x) for x in (data.label, data.image, data.texts, data.describes))
-    label, image, texts, describes = rows
-    paired = PairedEmbeddings(
-        touch=touch, label=label, image=image, texts=texts, describes=describes
-    )
-    heads = fit_heads(paired, HeadsConfig(epochs=60, batch_size=100), 0)
-    again = fit_heads(paired, HeadsConfig(epochs=60, batch_size=100), 0)
-    assert torch.equal(heads.text.linear.weight, again.text.linear.weight)
-    texts = heads.text(paired.texts).detach()
-    images = heads.image(paired.image[:, 0]).detach()
-    owner = paired.describes.long().argmax(0)
-    assert (owner[(touch @ texts.T).argmax(1)] == paired.label).float().mean() > 0.9
-    assert (paired.label[(touch @ images.T).argmax(1)] == paired.label).float().mean() > 0.9
-
-
 def test_a_surface_is_called_what_it_is() -> None:
     x = np.linspace(0, 2 * np.pi, TILE, endpoint=False, dtype=np.float32)
     fine, coarse = np.sin(64 * x), np.sin(6 * x)
@@ -162,11 +140,6 @@ def test_words_are_added_to_an_encoder_that_stays_as_it_is(
     assert row["2"][0] == 100
 
 
-def test_fewer_candidates_are_hit_more_often() -> None:
-    hits = _hits(np.array([0, 1, 4]), objects=5, candidates=2)
-    np.testing.assert_allclose(hits, [1, 3 / 4, 0])
-
-
 @pytest.mark.parametrize("name", ["retrieval", "classification"])
 def test_the_benchmarks_run(
     name: str, wand: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -184,16 +157,6 @@ def test_the_benchmarks_run(
         assert {"efficientnet trained", "efficientnet trained, without touch-text"} <= {
             row["row"] for row in rows
         }
-
-
-def test_a_touch_encoder_is_aligned_on_the_wands_touches(wand: Path, tmp_path: Path) -> None:
-    command = f"train-encoder align --data {wand} --out {tmp_path / 'run'} --split sample"
-    command += " --align.backbone efficientnet --align.epochs 1 --align.batch-size 8"
-    assert main(command.split()) in (0, None)
-    encoder = load_encoder(tmp_path / "run/encoder", "gelsight_mini")
-    assert encoder.towers == "offline"
-    picture = np.random.default_rng(0).integers(0, 255, (2, 240, 320, 3), dtype=np.uint8)
-    np.testing.assert_allclose(np.linalg.norm(encoder.embed(picture), axis=1), 1, atol=1e-4)
 
 
 def test_touches_of_another_sensor_choose_among_sentences(

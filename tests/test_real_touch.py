@@ -98,12 +98,6 @@ def test_sentences_are_judged_on_objects_never_seen() -> None:
     assert sentences_right(noise, ranks, objects, embed_texts).mean() < 0.5
 
 
-def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match="was not trained by"):
-        main(["train-encoder", "adapt", "--data", str(clips), "--encoder", "gelsight_mini_markers",
-              "--out", str(tmp_path / "a")])  # fmt: skip
-
-
 def test_sentences_lie_where_what_they_tell_of_is_felt() -> None:
     """Touches along orthogonal directions; a combination of ranks held out of the fit is named."""
     rng = np.random.default_rng(0)
@@ -171,20 +165,6 @@ def test_forces_come_with_their_frames(tmp_path: Path) -> None:
     assert read_force_grasps(tmp_path, corners)[0].frames().shape == (40, 240, 320, 3)
     result = forces.run(forces.Config(data=tmp_path, encoders=("pixels",)))
     assert result["cost"] == {} and result["objects"] == 3
-
-
-@pytest.mark.parametrize(
-    ("damage", "says"),
-    [
-        (lambda t: t.replace("hardness", "firmness"), "lacks the column hardness"),
-        (lambda t: t.replace(",0,0,1", ",7,0,1"), "a rank that is not 0, 1 or 2"),
-    ],
-)
-def test_unfit_labels_are_refused(clips: Path, tmp_path: Path, damage, says: str) -> None:
-    (tmp_path / "videos").symlink_to(clips / "videos")
-    (tmp_path / "labels.csv").write_text(damage((clips / "labels.csv").read_text()))
-    with pytest.raises(UserError, match=says):
-        read_labelled_videos(tmp_path)
 
 
 def test_properties_of_unseen_objects_are_predicted() -> None:

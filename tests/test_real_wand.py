@@ -20,7 +20,7 @@ from numbered_pictures import until
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.wand import WandReading
-from touchgoal.control.cell.wand_recorder import WandRecorder, evenly_loaded
+from touchgoal.control.cell.wand_recorder import WandRecorder
 from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.control.wand_touch import FORCE_RANGES, MAX_FORCE, WandTouch
@@ -203,25 +203,6 @@ def test_a_silent_load_cell_is_said(person: Person, tmp_path: Path) -> None:
         collect(person, tmp_path / "run", "--object", "screw")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--object", "pear"], "unknown object 'pear'; choose from: apple, .*--description"),
-        (["--object", "apple", "--sensor", "digit"], "the file names the sensor"),
-        (["--object", "apple"], "wand.toml: cameras.wand is missing: Camera on the wand"),
-    ],
-)
-def test_mistakes_are_one_line(options: list[str], message: str, tmp_path: Path) -> None:
-    file = tmp_path / "wand.toml"
-    camera = '{ source = "0" }'
-    file.write_text(
-        f'gel.source = "A"\nload_cell = {{ port = "p", newtons_per_count = 1, zero = 0 }}\n'
-        f"cameras = {{ top = {camera}, side_left = {camera}, side_right = {camera} }}\n"
-    )
-    with pytest.raises(SystemExit, match=message):
-        main(["collect-touches", "--wand", str(file), "--out", str(tmp_path / "run"), *options])
-
-
 class Hand:
     """Feeds a recorder with readings of a press; the gel may have a scratch."""
 
@@ -273,9 +254,3 @@ def test_a_touch_that_does_not_count_is_said(ramp: np.ndarray) -> None:
     made = hand.recorder.finish()  # Ctrl-C before the lift
     assert made is not None and made.load[-1] == pytest.approx(8.0, abs=0.05)
     assert made.before["top"].max() == 0 and made.views["top"].min() == 1
-
-
-def test_a_clip_rises_evenly() -> None:
-    forces = np.array([0.4, 0.5, 3.0, 3.9, 4.1, 8.2, 11.0, 12.1, 15.8, 16.2, 19.0, 20.0])
-    assert evenly_loaded(forces, 5) == [4, 5, 7, 8, 11]
-    assert evenly_loaded(np.array([1.0, 9, 9, 9, 10]), 5) == [0, 1, 2, 3, 4]

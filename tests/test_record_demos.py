@@ -15,15 +15,12 @@ import pytest
 from fake_cell import write_cell_file
 
 from touchgoal.control import features as ft
-from touchgoal.control.deployment.control_loop import RunLog
 from touchgoal.control.deployment.scripted import PickPlacePoses
-from touchgoal.control.deployment.session import distance_gone
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
-from touchgoal.control.sensors.keyboard import Keyboard
 from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import HandMotion, Verdict
 from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
@@ -253,26 +250,9 @@ def test_a_person_leads_the_arm_by_keys(tmp_path: Path) -> None:
     assert found.read(0).frames[ft.ACTION][:, :-1].any()
 
 
-def test_progress_is_the_share_of_the_distance_that_is_gone() -> None:
-    rows = [{ft.COST: np.array([cost], np.float32)} for cost in (0.4, 0.6, 0.1)]
-    assert distance_gone(RunLog(rows)) == pytest.approx(0.75)
-    assert distance_gone(RunLog(rows[:2])) == 0 and distance_gone(RunLog()) is None
-
-
 def test_recording_needs_a_person(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cell = write_cell_file(tmp_path, CELL)
     monkeypatch.setattr("sys.stdin", open(os.devnull))
     with pytest.raises(SystemExit, match="nobody is there to lead the arm"):
         run("record-demos", cell, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_terminal_that_goes_is_said() -> None:
-    end, terminal = os.openpty()
-    with os.fdopen(terminal) as stream, Keyboard(stream) as keyboard:
-        os.write(end, b"w d")
-        select.select([terminal], [], [], 5)
-        assert keyboard.read_keys() == "w d" and keyboard.read_keys() == ""
-        os.close(end)
-        with pytest.raises(UserError, match="the terminal has gone"):
-            keyboard.read_keys()

@@ -112,14 +112,6 @@ def test_errors_are_one_line(s3: S3Server, address: str, message: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_no_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-    remote._open.cache_clear()
-    with pytest.raises(UserError, match="cannot read s3://bucket/set .*check the address, the net"):
-        EpisodeSet("s3://bucket/set")
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("in_process")
 def test_commands_read_lerobot_sets_there(

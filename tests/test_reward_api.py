@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from safetensors.torch import save_file
-from sparsh_files import published
 from test_episode_embedder import PaintTowers, recorded
 
 from touchgoal.control.cell.cell_file import EXAMPLES, read_cell_file
@@ -179,21 +177,6 @@ def test_frame_rate_of_a_folder_of_images(tmp_path: Path) -> None:
         Image.fromarray(image).save(tmp_path / f"{i}.png")
     [fast] = open_source(tmp_path, "front", fps=50).trajectories
     assert fast.fps == 50 and fast.length == 12
-
-
-def test_a_run_folder_stands_for_its_episodes(run_folder: Path) -> None:
-    source = open_source(run_folder, "front")
-    assert [t.name for t in source.trajectories] == ["episode_000", "episode_001", "episode_002"]
-    assert str(run_folder / "episodes") in source.summary
-
-
-def test_published_weights_bring_no_normalizer(run_folder: Path, tmp_path: Path) -> None:
-    """The note is about them, not about the file of an encoder that is not used."""
-    weights = tmp_path / "mae_vittiny.safetensors"
-    save_file(published(), weights)
-    source = open_source(run_folder / "episodes", "front")
-    model = load_reward_model(source.inputs, [OwnFrame()], str(weights))
-    assert "published weights and loaded encoders come without a normalizer" in model.note
 
 
 def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(

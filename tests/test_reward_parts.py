@@ -12,7 +12,7 @@ from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, WRIST
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.embedding_distance import compute_curves
-from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, fit_units
+from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.rewards.distance.parts import (
     contact_distances,
@@ -153,13 +153,6 @@ def test_distances_by_hand() -> None:
     pieces = [smooth(cost[:4], 20)]
     pieces.append(smooth(cost[4:], 20, float(pieces[0][-1])))
     assert np.concatenate(pieces) == pytest.approx(smooth(cost, 20))
-
-
-def test_units_are_those_of_ends_with_the_same_object(successes: list[EmbeddedEpisode]) -> None:
-    units = fit_units(successes)
-    assert units["force"] < 0.3 and units["held"] == pytest.approx(1 / 3)
-    strangers = [replace(e, object=str(i)) for i, e in enumerate(successes)]
-    assert fit_units(strangers) == {}
 
 
 def test_a_value_is_refused_elsewhere(successes: list[EmbeddedEpisode], value: Value) -> None:

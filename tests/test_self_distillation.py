@@ -17,20 +17,10 @@ from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.sparsh import backbone_for
 from touchgoal.encoders.ssl import train
 from touchgoal.encoders.ssl.config import (
-    DINO_PRESETS,
-    IJEPA_PRESETS,
-    MAE_PRESETS,
-    VJEPA_PRESETS,
     DinoConfig,
 )
 from touchgoal.encoders.ssl.dino import Dino
 from touchgoal.encoders.ssl.frames import sample_frames
-from touchgoal.encoders.ssl.masks import (
-    draw_blocks,
-    draw_equal_counts,
-    draw_targets,
-    union_of_blocks,
-)
 from touchgoal.encoders.ssl.self_distillation import SelfDistillation
 from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.ssl.validation import token_statistics
@@ -108,18 +98,6 @@ def test_weight_decay_goes_along_a_cosine_for_matrices_alone() -> None:
     assert min(p.ndim for p in first["params"]) == 2 and second["weight_decay"] == 0
 
 
-def test_what_is_seen_is_not_asked_for() -> None:
-    within = union_of_blocks(draw_blocks((8, 10), (8, 9), 50, 1, rng()), 80)
-    ids, left = draw_targets((8, 10), (4, 4), 50, 4, within, 10, rng(1))
-    assert left.sum(1).min() >= 10
-    assert not left.gather(1, ids.flatten(1)).any() and (within | ~left).all()
-    seen = draw_equal_counts(left, rng(2))
-    assert seen.shape == (50, left.sum(1).min())
-    assert left.gather(1, seen).all() and (seen.diff(dim=1) > 0).all()
-    with pytest.raises(UserError, match="1 blocks of 3 x 4 patches leave hardly ever 1 of the 3 x"):
-        draw_targets((3, 4), (3, 4), 2, 1, torch.ones(2, 12, dtype=torch.bool), 1, rng())
-
-
 def test_codes_of_places_do_not_hide_a_collapse() -> None:
     places = torch.randn(1, 12, 16, generator=rng())
     touches = torch.randn(64, 1, 16, generator=rng(1))
@@ -171,21 +149,3 @@ def test_moments_hold_the_true_past(tmp_path: Path) -> None:
     assert ticks == [[t, max(t - 2, 0), max(t - 4, 0)] for t in range(6)]
     single = sample_frames(EpisodeSet(tmp_path), SENSOR, 6, 0)
     assert torch.equal(single.touch, moments.touch[:, 0]) and single.stride == 1
-
-
-@pytest.mark.parametrize(
-    ("presets", "lr", "batch_size", "momentum"),
-    [
-        (MAE_PRESETS, 1e-4, 100, None),
-        (DINO_PRESETS, 1e-4, 150, 0.998),
-        (IJEPA_PRESETS, 6.25e-4, 150, 0.996),
-        (VJEPA_PRESETS, 6.25e-4, 150, 0.996),
-    ],
-    ids=["mae", "dino", "ijepa", "vjepa"],
-)
-def test_the_paper_presets_are_table_2(presets, lr, batch_size, momentum) -> None:
-    paper = presets["paper"]
-    assert (paper.lr, paper.batch_size, paper.epochs) == (lr, batch_size, 150)
-    assert (paper.weight_decay, paper.final_weight_decay) == (0.04, 0.4)
-    assert paper.warmup * paper.epochs == 30
-    assert getattr(paper, "momentum", None) == momentum

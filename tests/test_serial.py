@@ -139,11 +139,6 @@ def test_an_unplugged_load_cell_is_said(line: tuple[int, str]) -> None:
     cell.close()
 
 
-def test_a_missing_port_is_said_in_a_line() -> None:
-    with pytest.raises(UserError, match="dialout"):
-        SerialLoadCell(LoadCellConfig("/dev/no_such_port", 1.0, 0.0, 1.0))
-
-
 class Gripper2F85(threading.Thread):
     """The gripper's side of the wire: registers and a finger that takes 10 counts an exchange.
 

@@ -12,13 +12,10 @@ from touchgoal.benchmarks.papers.tacbench.benchmark import run
 from touchgoal.benchmarks.papers.tacbench.config import Config
 from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, read_strokes
 from touchgoal.benchmarks.papers.tacbench.force import force_metrics
-from touchgoal.benchmarks.papers.tacbench.pose import CLASSES, PoseTask
 from touchgoal.benchmarks.papers.tacbench.slip import f1_score, slip_metrics
 from touchgoal.benchmarks.papers.tacbench.task import split_force, split_slip
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
-from touchgoal.control.tactile.markers import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
-from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as MINI
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.encoders.preprocess import preprocessor_for
@@ -29,16 +26,12 @@ from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import RigConfig
-from touchgoal.sim_envs.indenter_rig import REST, rig_unit, shear_force, simulate
+from touchgoal.sim_envs.indenter_rig import REST, shear_force, simulate
 from touchgoal.sim_envs.object_slides import (
     FRAMES,
-    mean_radius,
-    simulate_catalogue_slide,
     simulate_slide,
     stick_slip_force,
 )
-from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
-from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 
 RIG = RigConfig(seed=3)
 STROKES = 15
@@ -121,40 +114,6 @@ def test_a_slide_pulls_at_the_gel_up_to_the_cone() -> None:
     assert (field < [3.6e-3, 3.6e-3, np.radians(31)]).all()
 
 
-def test_torsion_turns_the_dots_the_way_the_object_turns() -> None:
-    """An upright can: a disc, whose mean radius is two thirds of its own."""
-    unit, radius, load = rig_unit(RIG), 4e-3, 4.0
-    smooth = replace(CATALOGUE["glass_ball"], shape="cylinder")
-    bench = PressBench(Body(smooth, (radius, 4e-3), 0.1), MINI, unit)
-    bench.place(np.zeros(3))
-    depth, rng = -load / MINI.normal_stiffness, np.random.default_rng(0)
-    field = bench.sense(load, rng, depth=depth).field
-    assert field is not None
-    assert mean_radius(field) == pytest.approx(2 / 3 * radius, rel=0.05)
-    assert MINI.markers is not None
-    for torsion in (8e-3, -8e-3):
-        rest = bench.sense(0.0, rng).image
-        tracker = MarkerTracker(rest, MINI.markers, MINI.pixel_pitch)
-        tracker.update(bench.sense(load, rng, depth=depth).image)
-        before = tracker.displacement
-        tracker.update(bench.sense(load, rng, depth=depth, torsion=torsion).image)
-        moved, at = tracker.displacement - before, tracker.rest.positions
-        away = at - (np.array(rest.shape[1::-1]) - 1) / 2
-        under = np.linalg.norm(away, axis=-1) * MINI.pixel_pitch < 0.8 * radius
-        turns = (away[..., 0] * moved[..., 1] - away[..., 1] * moved[..., 0])[under]
-        assert np.sign(turns.mean()) == np.sign(torsion) and np.abs(turns).mean() > 5
-
-
-def test_objects_to_learn_from_are_slid_on_units_of_their_own() -> None:
-    """Drawn the same each time; the bench's own slides are on one unit."""
-    first, again, other = (simulate_catalogue_slide(RIG, k) for k in (0, 0, 1))
-    np.testing.assert_array_equal(first.frames, again.frames)
-    rest = [slide.frames[:REST].astype(float).mean(0) for slide in (first, other)]
-    assert np.abs(rest[0] - rest[1]).mean() > 5  # counts: another light
-    assert np.abs(first.frames[REST].astype(float) - rest[0]).max() > 15
-    assert len({first.held, other.held}) == 2 and 0 < first.slip.mean() < 1
-
-
 def test_an_object_is_seen_where_it_lies() -> None:
     """Axes and signs: the middle and the turn of what changes in the picture are about those of the pose.
 
@@ -184,18 +143,6 @@ def blank_frames(stroke: np.ndarray, indenter: np.ndarray) -> RigFrames:
         stroke=stroke,
         indenter=indenter,
     )
-
-
-def test_classes_of_a_change_are_the_papers() -> None:
-    pose = torch.tensor([0, 0.05, -0.25, 0.45, 5.5, -4, -4.15, -3.6, -2.15, -4.75])
-    frames = blank_frames(np.arange(10), np.array(["bar"] * 10))
-    frames = replace(frames, before=torch.tensor([0, *range(9)]))
-    task = PoseTask(replace(frames, pose=pose[:, None] * torch.tensor([1, 1, 0.4])))
-    # changes, mm: 0, .05, -.3, .7, 5.05, -9.5, -.15, .55, 1.45, -2.6; turns are 0.4 of them, degrees
-    assert task.classes[:, 0].tolist() == [5, 5, 4, 7, 10, 0, 4, 7, 8, 1]
-    assert task.classes[:, 2].tolist() == [5, 5, 4, 7, 10, 0, 4, 7, 8, 1]
-    wanted = torch.nn.functional.one_hot(task.classes, CLASSES).flatten(1).float()
-    assert task.error(wanted, torch.arange(10)) == 0
 
 
 def test_metrics_are_what_they_are_called() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from published_files import gel, write_force_batch, write_grasps, write_pose_set
+from published_files import gel, write_force_batch, write_pose_set
 
 from touchgoal.benchmarks.papers.tacbench.benchmark import run
 from touchgoal.benchmarks.papers.tacbench.config import Config
@@ -21,7 +21,6 @@ from touchgoal.benchmarks.papers.tacbench.published_recordings import (
 from touchgoal.benchmarks.papers.tacbench.task import split_force, split_grasp
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.encoders.probes.dense import DenseProbe
 from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.episodes.importers.tacbench_poses import read_bags
 from touchgoal.runtime.errors import UserError
@@ -109,28 +108,6 @@ def test_a_cloths_yarns_are_as_many_as_it_says(tmp_path: Path) -> None:
     assert task.truth(torch.tensor([0, FRAMES, 20 * FRAMES])).tolist() == [0, 1, 0]
 
 
-def test_a_dense_probe_puts_values_where_they_belong() -> None:
-    torch.manual_seed(0)
-    probe = DenseProbe(features=12, grid=(3, 4), planes=1, side=12, width=16)
-    optimizer, generator = torch.optim.Adam(probe.parameters(), lr=1e-2), torch.Generator()
-    generator.manual_seed(0)
-
-    def wrong() -> tuple[torch.Tensor, torch.Tensor]:
-        tokens = torch.randn(16, 12, 12, generator=generator)
-        wanted = tokens[:, :, :1].transpose(1, 2).unflatten(2, (3, 4))
-        wanted = torch.nn.functional.interpolate(wanted, (12, 12), mode="bilinear")
-        return (probe(tokens) - wanted).square().mean(), wanted.square().mean()
-
-    for _ in range(120):
-        optimizer.zero_grad()
-        wrong()[0].backward()
-        optimizer.step()
-    loss, size = wrong()
-    assert loss < 0.3 * size
-    tokens, class_token = torch.randn(2, 12, 12), torch.randn(2, 1, 12)
-    assert torch.equal(probe(torch.cat([class_token, tokens], 1)), probe(tokens))
-
-
 def test_metrics_of_labels_and_fields_by_hand() -> None:
     truth, predicted = np.array([0, 0, 0, 1]), np.array([[0, 0, 1, 1], [0, 0, 0, 0]])
     metrics = label_metrics(predicted, truth, np.arange(4))
@@ -192,19 +169,6 @@ def test_bags_become_classes_of_their_motions(tmp_path: Path) -> None:
     bags = np.unique(frames.stroke[task.split.tests["known objects"].numpy()])
     assert bags.tolist() == list(range(10, 20))  # the published test bags
     assert np.unique(frames.stroke[task.split.validation.numpy()]).tolist() == [4, 9]
-
-
-def test_grasps_are_pairs_of_moments(tmp_path: Path) -> None:
-    write_grasps(tmp_path / "000.pkl", [True, False] * 6)
-    write_grasps(tmp_path / "030.pkl", [True, False])
-    published = find_published(tmp_path, "gelsight_mini")
-    assert published is not None and published.sensor == "gelsight"
-    frames = published.read(14, GELSIGHT)
-    assert len(frames.touch) == 14 * 2 * 3 and frames.before[:6].tolist() == [0, 0, 1, 3, 3, 4]
-    split = split_grasp(frames)
-    tested = torch.cat(list(split.tests.values()))
-    assert np.unique(frames.stroke[tested.numpy()]).tolist() == [12, 13]
-    assert frames.label is not None and frames.label[tested].sum() == len(tested) / 2
 
 
 def test_the_benchmark_takes_published_files(

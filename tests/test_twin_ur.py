@@ -67,46 +67,6 @@ def test_ur_moves_servoes_and_watches(ur5e: RunningTwin) -> None:
     assert ur5e.ask("truth")["worst"]["excess"] <= 0
 
 
-def asks_too_much(address: str) -> dict:
-    """Calls what the twin does not simulate, and moves afterwards."""
-    from rtde_control import RTDEControlInterface
-    from rtde_receive import RTDEReceiveInterface
-
-    receive, control = RTDEReceiveInterface(address), RTDEControlInterface(address)
-    q = np.array(receive.getActualQ())
-    control.moveJ(q.tolist(), 1.0, 1.0)
-
-    def refused(call) -> bool:
-        try:
-            return call() is False
-        except RuntimeError:
-            return True
-        finally:
-            time.sleep(0.1)  # the news that the program runs has to come
-
-    path = [[*(q + way).tolist(), 0.5, 0.5, 0.0] for way in (0.05, 0.1)]
-    result = {
-        "path": refused(lambda: control.moveJ(path)),
-        "contact": refused(lambda: control.moveUntilContact([0, 0, -0.05, 0, 0, 0])),
-        "moved": float(np.abs(np.array(receive.getActualQ()) - q).max()),
-    }
-    result["goes on"] = control.moveJ((q + 0.05).tolist(), 1.0, 1.0)
-    result["short"] = float(np.abs(np.array(receive.getActualQ()) - q - 0.05).max())
-    control.directTorque([5.0, 0, 0, 0, 0, 0])  # True whatever happens
-    time.sleep(0.3)
-    result["torque"] = receive.isProtectiveStopped()
-    result["gone"] = float(np.abs(np.array(receive.getActualQ()) - q - 0.05).max())
-    return result
-
-
-def test_ur_refuses_what_it_does_not_simulate_and_goes_on(ur5e: RunningTwin) -> None:
-    result = client(asks_too_much, ur5e.cell.address)
-    assert result["path"] and result["contact"] and result["moved"] < 2e-3
-    assert result["goes on"] and result["short"] < 2e-3
-    assert result["torque"] and result["gone"] < 2e-3
-    ur5e.begin("reset 3")  # which clears the protective stop
-
-
 def places(address: str, port: str, pick: list[float], place: list[float], yaw: float) -> dict:
     """Picks and places through ur-rtde, with the gripper's registers by minimalmodbus."""
     import minimalmodbus

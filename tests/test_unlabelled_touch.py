@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from published_files import encoded, gel, write, write_slides
+from published_files import encoded, gel, write
 from toy_episodes import FPS, make_episode
 from toy_policies import TOY, toy_observations
 
@@ -17,17 +17,14 @@ from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, To
 from touchgoal.encoders.backbones.vit import PRESETS, ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import load_encoder, save
-from touchgoal.encoders.ssl.config import DINO_PRESETS
 from touchgoal.encoders.ssl.unlabelled_touch import open_touch
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.overlap import require_no_shared_frames
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.launch.__main__ import read_options
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.network import PolicyNetwork
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
-from touchgoal.policies.training.training_data import leading_pause
 from touchgoal.runtime.errors import UserError
 
 SPLITS = "train", "unlabelled", "val", "test"
@@ -93,25 +90,6 @@ def test_shared_frames_are_refused_whatever_the_folder_and_the_order(tmp_path: P
         open_touch([tmp_path / "a"], [tmp_path / "b"], "gelsight_mini")
 
 
-def test_what_cannot_be_learned_from_together_is_one_line(tmp_path: Path) -> None:
-    videos = write_videos(tmp_path / "videos")
-    write_slides(tmp_path / "slides", ("mug",))
-    with pytest.raises(UserError, match="slides was recorded with digit, not gelsight_mini"):
-        open_touch([videos, tmp_path / "slides"], (), None)
-    with pytest.raises(UserError, match="videos holds no recordings out: .* --validation"):
-        open_touch([write_videos(tmp_path / "a" / "videos", ("train",))], (), None)
-    with pytest.raises(UserError, match="leave --validation out"):
-        open_touch([videos], [tmp_path / "slides" / ".." / "videos"], None)
-
-
-def test_a_preset_sets_defaults_that_options_override() -> None:
-    words = ["dino", "--data", "x", "--preset", "paper", "--dino.epochs", "3"]
-    _, config = read_options("train-encoder", words)
-    assert config.dino == replace(DINO_PRESETS["paper"], epochs=3)
-    _, config = read_options("train-encoder", ["dino", "--data", "x"])
-    assert config.dino == DINO_PRESETS["default"]
-
-
 def write_set(root: Path, episodes: list[Episode]) -> EpisodeSet:
     writer = EpisodeWriter(root, FPS)
     for episode in episodes:
@@ -141,16 +119,6 @@ def test_a_common_resting_start_is_no_overlap(tmp_path: Path) -> None:
         episode.frames[ft.STATE][:15] = 0.5
     train, validation = (write_set(tmp_path / str(i), [e]) for i, e in enumerate(episodes))
     require_no_shared_frames(train, validation)
-
-
-def test_a_pause_at_the_start_is_found() -> None:
-    state, action = np.zeros((30, 15), np.float32), np.zeros((30, 8), np.float32)
-    action[:, 7], state[:, 14] = 0.08, 0.08
-    state[:, 0] += np.random.default_rng(0).normal(0, 1e-4, 30)  # encoder noise is no motion
-    moving, closing = action.copy(), action.copy()
-    moving[12:, 1], closing[5:, 7] = 0.01, 0.0
-    for done, pause in ((action, 0), (moving, 12), (closing, 5)):
-        assert leading_pause(Episode({ft.STATE: state, ft.ACTION: done}, "wait")) == pause
 
 
 STRIDE = 3
