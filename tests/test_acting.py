@@ -186,18 +186,3 @@ def test_who_stands_still_is_off_by_the_way(demonstration: SequenceDataset) -> N
     np.testing.assert_allclose(errors.free_running, way, atol=0.01)
     assert errors.chunk[7] == pytest.approx(way[7], rel=0.1)
     assert errors.path == pytest.approx(way[-1] - way[0], rel=0.05)
-
-
-def test_a_free_run_sees_what_it_compounded(demonstration: SequenceDataset) -> None:
-    """A planner that aims at a posture ends there, though the recording does not."""
-    aim = torch.from_numpy(START - 0.02).float()
-
-    def plan(batch: ObservationBatch) -> torch.Tensor:
-        step = 0.5 * (aim - batch.joints)
-        return torch.cat([step, step[:, :1] * 0], 1)[:, None].expand(-1, 8, -1)
-
-    errors, kinematics = open_loop_errors(plan, demonstration, HZ), Fr3Kinematics()
-    aimed = kinematics.forward(START - 0.02)[0]
-    end = kinematics.forward(START + TICKS * CHANGE)[0]
-    assert errors.free_running[-1] == pytest.approx(1e3 * np.linalg.norm(end - aimed), abs=0.05)
-    assert errors.teacher_forced[-1] > 2 * errors.free_running[-1]

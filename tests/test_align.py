@@ -9,6 +9,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from interrupted_training import killed_in_epoch
+from toy_towers import PaintTowers, TogetherTowers
 
 from touchgoal.encoders.alignment.align import AlignedBatch, align, batch_losses
 from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig, Augmentation
@@ -34,28 +35,6 @@ DESCRIPTIONS = {
 CONFIG = AlignConfig(backbone="vit-tiny", embedding_dim=16, epochs=3, batch_size=16, lr=3e-3)
 
 
-class FakeTowers:
-    """Towers that embed images by mean colour and sentences by their letters."""
-
-    name, pretrained_together, image_dim, text_dim = "fake", False, 3, 26
-
-    def embed_images(self, images: np.ndarray) -> torch.Tensor:
-        return torch.tensor(images.mean((1, 2)), dtype=torch.float32) / 255 - 0.5
-
-    def embed_texts(self, texts: list[str]) -> torch.Tensor:
-        letters = "abcdefghijklmnopqrstuvwxyz"
-        return torch.tensor([[float(t.count(letter)) for letter in letters] for t in texts])
-
-
-class TogetherTowers(FakeTowers):
-    """Towers whose pictures and sentences share a space, as a CLIP's."""
-
-    pretrained_together, image_dim = True, 26
-
-    def embed_images(self, images: np.ndarray) -> torch.Tensor:
-        return F.pad(super().embed_images(images), (0, 23))
-
-
 SENSOR, FRESH = "gelsight_mini", TrainerOptions()
 
 
@@ -66,7 +45,7 @@ def run_align(
     out_dir: Path,
     options: TrainerOptions = FRESH,
 ) -> TouchEncoder:
-    return align(train, val, FakeTowers(), config, SENSOR, out_dir, options, {})
+    return align(train, val, PaintTowers(), config, SENSOR, out_dir, options, {})
 
 
 def make_touches(per_episode: int, seed: int, per_object: int = 1) -> Touches:
@@ -106,7 +85,7 @@ TRAIN, VAL = make_touches(12, 0), make_touches(6, 1, per_object=4)
 
 
 def test_prepared_data_pairs_touch_with_object_and_view() -> None:
-    data = prepare_touch_data(TRAIN, FakeTowers(), "gelsight_mini", CONFIG.no_contact_texts)
+    data = prepare_touch_data(TRAIN, PaintTowers(), "gelsight_mini", CONFIG.no_contact_texts)
     assert data.names == ("", "ball", "brush", "cloth")
     assert [data.names[i] for i in data.label] == list(TRAIN.object)
     assert data.contact.tolist() == [name != "" for name in TRAIN.object]
@@ -117,7 +96,7 @@ def test_prepared_data_pairs_touch_with_object_and_view() -> None:
     assert not torch.equal(*drawn) and data.describes[data.label, drawn[0]].all()
     with pytest.raises(UserError, match="'brush' has no descriptions"):
         unnamed = replace(TRAIN, descriptions={"ball": ["round"]})
-        prepare_touch_data(unnamed, FakeTowers(), SENSOR, CONFIG.no_contact_texts)
+        prepare_touch_data(unnamed, PaintTowers(), SENSOR, CONFIG.no_contact_texts)
 
 
 def test_augmentation() -> None:
@@ -180,7 +159,7 @@ def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
     for modality, margin in (("text", 0.3), ("image", 0.1)):
         loss, floor = (history[-1][f"touch_to_{modality}_{k}"] for k in ("loss", "floor"))
         assert floor - 1e-4 <= loss < floor + margin
-    text = encoder.embed_text_goal(["a hard round ball", "a soft woven cloth"], FakeTowers())
+    text = encoder.embed_text_goal(["a hard round ball", "a soft woven cloth"], PaintTowers())
     ball = encoder.embed_frames(touches.frames[1:2], touches.background[0])
     assert (ball @ text[0]).item() > (ball @ text[1]).item() + 0.2
 
@@ -204,7 +183,7 @@ def test_killed_and_resumed_is_bit_identical(tmp_path: Path) -> None:
 def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> None:
     paper = replace(ALIGN_PRESETS["paper"], backbone="vit-tiny", epochs=1, batch_size=8)
     encoder = align(TRAIN, VAL, TogetherTowers(), paper, SENSOR, tmp_path, FRESH, {})
-    assert encoder.config.embedding_dim == 26 and encoder.image_head is None
+    assert encoder.config.embedding_dim == 48 and encoder.image_head is None
     metrics = json.loads((tmp_path / "metrics.jsonl").read_text())
     assert metrics["touch_to_image_loss"] >= metrics["touch_to_image_floor"] - 1e-4
     assert "contact_accuracy" not in metrics
@@ -226,7 +205,7 @@ def as_felt(view: torch.Tensor, label: torch.Tensor) -> tuple[TouchEncoder, Touc
         describes=torch.eye(2, dtype=torch.bool),
         names=names,
     )
-    config = TouchEncoderConfig.for_towers(PRESETS_VIT["tiny"], FakeTowers(), SENSOR, 16)
+    config = TouchEncoderConfig.for_towers(PRESETS_VIT["tiny"], PaintTowers(), SENSOR, 16)
     encoder = TouchEncoder(config)
     encoder.embed_touch = lambda touch, ids_keep=None: view
     encoder.project_text = encoder.project_image = lambda embeddings: embeddings
@@ -243,7 +222,7 @@ def test_a_touch_does_not_find_the_view_of_its_own_episode() -> None:
 
 
 def test_halves_share_objects_but_no_episodes() -> None:
-    data = prepare_touch_data(VAL, FakeTowers(), SENSOR, CONFIG.no_contact_texts)
+    data = prepare_touch_data(VAL, PaintTowers(), SENSOR, CONFIG.no_contact_texts)
     one, other = split_by_episode(data, seed=0)
     assert len(one) + len(other) == len(data)
     assert not set(one.view_index.tolist()) & set(other.view_index.tolist())

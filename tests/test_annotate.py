@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +21,7 @@ from visgel_scenes import (
 from touchgoal.encoders.annotation.annotate import annotate_all
 from touchgoal.encoders.annotation.boxes import iou
 from touchgoal.encoders.annotation.config import AnnotationSettings
-from touchgoal.encoders.annotation.frame_matching import match_contact, match_reference
-from touchgoal.encoders.annotation.records import AnnotatedTouch, LeftOut, read_annotations
+from touchgoal.encoders.annotation.records import AnnotatedTouch, read_annotations
 from touchgoal.encoders.annotation.touches import annotated_touches, open_annotations
 from touchgoal.episodes.importers.visgel import read_visgel_list
 from touchgoal.launch.__main__ import main
@@ -162,39 +161,6 @@ def test_lists_of_both_directions(tmp_path: Path) -> None:
     list_.write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(UserError, match=r"train_touch2vision.txt"):
         read_visgel_list(list_)
-
-
-def test_inactive_tactile_frames_do_not_count() -> None:
-    rng = np.random.default_rng(0)
-    gel = rng.integers(60, 180, (40, 50, 3))
-    frames = [(gel + rng.normal(0, 1, gel.shape)).round().astype(np.uint8) for _ in range(9)]
-    pressed = frames[6].copy()
-    pressed[10:30, 10:30] += 30
-    black = np.zeros_like(pressed)
-    stream = [*frames[1:6], black, frames[5], pressed, pressed, frames[0]]
-    assert match_contact(stream, frames[0], 1.5).index == 7
-    with pytest.raises(LeftOut, match="not enough"):
-        match_contact([*frames[1:], black], frames[0], 1.5)
-    with pytest.raises(LeftOut, match="fewer than 6"):
-        match_contact([*frames[1:6], black, black], frames[0], 1.5)
-
-
-def test_reference_is_the_first_unobstructed_frame() -> None:
-    over, beside = (10.0, 10.0, 30.0, 30.0), (40.0, 10.0, 60.0, 30.0)
-    assert match_reference([over, None, beside, over]) == 1
-    assert match_reference([over, beside, over]) == 1
-    with pytest.raises(LeftOut, match="hides"):
-        match_reference([over, over])
-    with pytest.raises(LeftOut, match="lost"):
-        match_reference([beside, None])
-
-
-def test_unreadable_image_leaves_its_recording_out(twenty: Set, tmp_path: Path) -> None:
-    root, scene, list_ = tmp_path / "data", twenty.scenes[0], tmp_path / "list.txt"
-    list_.write_text("\n".join(write_scene(root, scene, np.random.default_rng(1))))
-    (root / scene.contact_image.replace("vision", "touch")).write_bytes(b"no image")
-    metrics = replace(twenty, root=root, list=list_).annotate(tmp_path / "out", twenty.models())
-    assert metrics["left_out"] == {"an image is missing or unreadable": 1}
 
 
 @pytest.mark.slow

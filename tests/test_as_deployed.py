@@ -1,6 +1,5 @@
 """An environment as deployed: what is late is late by what it says, and what is off changes nothing."""
 
-import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -60,13 +59,6 @@ def test_what_is_seen_is_as_old_as_it_says(option: str) -> None:
         now, then = column(here, key), column(late, key)
         assert np.array_equal(then[ticks:], now[: len(now) - ticks]), key
         assert np.array_equal(then[:ticks], now[:1].repeat(ticks, 0)), key
-
-
-def test_slow_cameras_show_a_picture_again() -> None:
-    config = replace(BLIND, cameras=("front",), camera_size=(32, 32))
-    seen = column(roll(moving(), config, between={"picture_rate": 7.0}), ft.FRONT)
-    news = [not np.array_equal(*pair) for pair in itertools.pairwise(seen)]
-    assert 1 <= sum(news) <= 4  # 0.4 s at 7 Hz
 
 
 def test_a_command_arrives_so_late() -> None:
@@ -144,20 +136,6 @@ def test_a_policy_that_sees_commands_sees_no_delay() -> None:
     np.testing.assert_allclose(seen[0][0, 15:18], at_rest[:3], atol=2e-3)
     measured = network_input(torch.from_numpy(states[-1][:1, :22]), columns[:2], "base_twist")
     np.testing.assert_allclose(seen[0][0, 18:], measured[0, 18:].numpy(), atol=5e-3)
-
-
-def test_a_maze_may_begin_beside_the_wires_direction() -> None:
-    def beside(config: BeadMazeConfig, seed: int) -> float:
-        env = BeadMaze(replace(config, tactile=False))
-        env.reset(seed=seed)
-        _, R = env.kinematics.forward(env.command)
-        cosine = R[:, 0] @ env.wire.at(env.arc_length)[1]
-        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-    straight = BeadMazeConfig(wires=("helix-1",))
-    assert beside(straight, 0) < 0.1
-    angles = [beside(replace(straight, start_angle=15.0), seed) for seed in range(6)]
-    assert max(angles) > 2 and max(angles) < 15.1
 
 
 def test_the_truth_of_the_pads_is_as_old_as_their_pictures() -> None:

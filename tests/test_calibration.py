@@ -172,14 +172,9 @@ def set_row(column: int, value: str) -> Callable[[Path], None]:
             "8 presses, calibration needs at least 16",
         ),
         (lambda f: (f / "background.png").unlink(), "background.png is missing"),
-        (lambda f: edit(f, "presses.csv", lambda t: t.replace("file", "name")), "column file"),
         (set_row(1, "170"), "lies outside the 160 x 120 picture"),
         (set_row(3, "30"), "does not fit a ball of radius 3 mm"),
         (set_row(4, ""), "the ball's radius is missing"),
-        (
-            lambda f: cv2.imwrite(str(f / "00.png"), np.zeros((100, 100, 3), np.uint8)),
-            "100 x 100 pixels, background.png 160 x 120",
-        ),
         (lambda f: shutil.copy(f / "background.png", f / "00.png"), "shows no contact"),
     ],
 )
@@ -214,8 +209,6 @@ def test_sensor_file_comes_back(tmp_path: Path) -> None:
         (lambda f: (f / "background.png").unlink(), "background.png is missing"),
         (lambda f: edit(f, "sensor.json", lambda t: t[:99]), "is no sensor file"),
         (lambda f: edit(f, "sensor.json", lambda t: t.replace('t": 2', 't": 9')), "has format 9"),
-        (lambda f: edit(f, "sensor.json", lambda t: t.replace("noise", "nose")), "no usable noise"),
-        (lambda f: edit(f, "sensor.json", lambda t: t.replace("120,", "240,")), "rows and columns"),
         (lambda f: edit(f, "sensor.json", lambda t: t.replace("0.9", "-0.9")), "must be positive"),
     ],
 )

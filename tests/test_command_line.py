@@ -214,8 +214,6 @@ def test_a_full_disk_is_one_line_with_the_path(
             raise RuntimeError("PytorchStreamWriter failed writing file")
 
     monkeypatch.setattr(command, "main", save)
-    with pytest.raises(RuntimeError, match="Pytorch"):
-        main(["list"])
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=0))
     with pytest.raises(SystemExit, match="weights: No space left on device: free some space"):
         main(["list"])
@@ -234,7 +232,6 @@ def test_one_process_at_a_time_writes_into_a_folder(tmp_path: Path) -> None:
     ("config", "values", "message"),
     [
         (EnvConfig, {"camera_size": (97, 96)}, "camera_size must be a multiple of 2"),
-        (EnvConfig, {"control_hz": 60}, "control_hz is 60; it must divide 500"),
         (PickPlaceConfig, {"mass": (float("nan"),) * 2}, "mass must be a finite number, not nan"),
         (PickPlaceConfig, {"mass": (0.2, 0.1)}, "mass must go from less to more, not 0.2 to 0.1"),
         (BeadMazeConfig, {"wires": ("knot-1",)}, "wires unknown wire 'knot-1'"),

@@ -11,7 +11,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
-from test_episode_embedder import PaintTowers
+from toy_towers import PaintTowers
 
 from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.sensor_models import SENSORS
@@ -193,16 +193,10 @@ def cut_short(directory: Path) -> None:
 DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no json": (lambda d: (d / "encoder.json").unlink(), "no touch encoder.*train-encoder"),
     "no weights": (lambda d: (d / "encoder.safetensors").unlink(), "missing"),
-    "no json inside": (lambda d: (d / "encoder.json").write_text("{"), "damaged"),
     "old preprocessor": (
         lambda d: edit_json(d, lambda j: j["config"].update(preprocessor="gelsight_mini/v0")),
         "gelsight_mini/v0, this version has gelsight_mini/v1",
     ),
-    "no such field": (
-        lambda d: edit_json(d, lambda j: j["config"].update(colour="red")),
-        "damaged.*colour",
-    ),
-    "unknown kind": (lambda d: edit_json(d, lambda j: j["config"].update(kind="x")), "damaged.*x"),
     "future format": (lambda d: edit_json(d, lambda j: j.update(format=99)), "format 99"),
     "wrong weights": (
         wrong_weights,
@@ -227,8 +221,6 @@ def test_damaged_files_are_refused(tmp_path: Path, damage: str) -> None:
     [
         (lambda x: x / 255, r"not of float64: values of 0 to 1 become"),
         (lambda x: np.moveaxis(x, -1, -3), "put the colours last"),
-        (lambda x: x[..., 0], r"not of shape \(3, 240, 320\)"),
-        (lambda x: x[:0], "at least one"),
         (lambda x: x[:, :, :120], "1.33 times as wide as high"),
         (lambda x: x[0], "one image needs its background"),
     ],

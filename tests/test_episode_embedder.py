@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Float, UInt8
 from PIL import Image
-from torch import Tensor
+from toy_towers import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
@@ -30,26 +29,6 @@ from touchgoal.rewards.goals import (
 from touchgoal.runtime.errors import UserError
 
 ALL: tuple[Modality, ...] = ("image", "tactile", "text")
-
-
-class PaintTowers:
-    """Towers that see coarse colours and hear letters; no weights to load."""
-
-    image_dim = 48
-    text_dim = 8
-    pretrained_together = False
-
-    def __init__(self, name: str = "paint") -> None:
-        self.name = name
-
-    def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
-        n, h, w, _ = images.shape
-        coarse = images.reshape(n, 4, h // 4, 4, w // 4, 3).mean((2, 4)).reshape(n, -1)
-        return torch.from_numpy(coarse.astype(np.float32)) + 1
-
-    def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
-        letters = [[text.count(c) + 0.5 for c in "aeioursl"] for text in texts]
-        return torch.tensor(letters)
 
 
 def recorded(n: int = 12, contact: int = 7, color: int = 200) -> Episode:

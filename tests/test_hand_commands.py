@@ -170,10 +170,3 @@ def test_a_stopped_hand_takes_no_more_commands_but_to_let_go(
     assert hand.commands == commands
     with pytest.raises(DriverError, match="stopped"):
         client.command(0.05)
-
-
-def test_a_hands_fault_reaches_the_reading(monkeypatch: pytest.MonkeyPatch) -> None:
-    client, _ = connected(monkeypatch, between=0.0)
-    monkeypatch.setattr(Franky, "state", None)
-    client.tick()
-    assert "AttributeError" in client.read().fault and client.read().width == OPEN

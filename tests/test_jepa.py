@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from interrupted_training import killed_in_epoch
@@ -13,7 +12,6 @@ from test_mae import blobs
 from test_self_distillation import TOY as DINO
 from toy_touches import moving_blobs
 
-from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.sparsh import Method, backbone_for, vit_for
 from touchgoal.encoders.ssl.config import (
     IJEPA_PRESETS,
@@ -158,23 +156,6 @@ def test_a_killed_training_ends_with_the_same_weights(config: Any, tmp_path: Pat
         assert torch.equal(a, b)
     lines = [(tmp_path / run / "metrics.jsonl").read_text() for run in ("whole", "killed")]
     assert lines[0] == lines[1]
-
-
-@pytest.mark.parametrize(
-    ("config", "offsets"),
-    [(DINO, [0, 2]), (ITOY, [0, 2]), (VTOY, [0, 2, 4, 6])],
-    ids=["dino", "ijepa", "vjepa"],
-)
-def test_a_saved_encoder_sees_its_past_alone(
-    config: Any, offsets: list[int], tmp_path: Path
-) -> None:
-    data = moving_blobs(24, frames=len(offsets))
-    train_unlabelled(data, data, replace(config, epochs=1), tmp_path, TrainerOptions(), {})
-    encoder = pretrained.load_encoder(tmp_path / "encoder")
-    frames = np.full((8, 240, 320, 3), 100, np.uint8)
-    frames[1, 60:120, 80:160] = 160
-    rows = encoder.embed(frames)
-    assert [not np.allclose(row, rows[0]) for row in rows] == [i - 1 in offsets for i in range(8)]
 
 
 @pytest.mark.parametrize(

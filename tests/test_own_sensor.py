@@ -71,15 +71,6 @@ def test_a_gel_that_is_touched_first_is_waited_for(session: list[np.ndarray]) ->
     assert recorder.hint == "press at the top, left"
 
 
-def test_a_press_that_never_stands_still_is_not_kept(session: list[np.ndarray]) -> None:
-    recorder = PressRecorder((240, 320))
-    for frame in session[:30]:
-        recorder.update(frame)
-    for x in range(-60, 60, 8):
-        assert not recorder.update(pressed(x, 0.0, 0.4))
-    assert recorder.hint == "hold still"
-
-
 def test_record_presses_writes_what_calibrate_reads(
     session: list[np.ndarray], tmp_path: Path
 ) -> None:

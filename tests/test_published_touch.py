@@ -180,29 +180,6 @@ def test_a_mini_lies_and_a_batch_of_exchanged_colours_is_mended(tmp_path: Path) 
         next(read_strokes(tmp_path, "digit"))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda v: v.pop("trajectories"), "has no 'trajectories'"),
-        (lambda v: v.update(in_contact=np.ones(16)), "labelled as without contact"),
-        (lambda v: v["trajectories"][0].update(forces=np.full((6, 3), np.nan)), "not all between"),
-        (lambda v: v["trajectories"][0].update(indexes=np.arange(3)), "3 images, 6 forces"),
-        (lambda v: v["trajectories"][0].update(slip_label=np.full(6, 2)), "from 0 to 1"),
-    ],
-)
-def test_wrong_labels_are_one_line(
-    tmp_path: Path, change: Callable[[dict[str, Any]], object], message: str
-) -> None:
-    batch = tmp_path / "sphere" / "batch_1"
-    write_force_batch(batch)
-    value = pickle.loads((batch / "dataset_slip_forces.pkl").read_bytes())
-    change(value)
-    write(batch / "dataset_slip_forces.pkl", value)
-    with pytest.raises(UserError, match=message) as refused:
-        list(read_strokes(tmp_path))
-    assert "\n" not in str(refused.value)
-
-
 def test_bags_have_motions_in_metres_and_radians(tmp_path: Path) -> None:
     write_pose_set(tmp_path)
     bags = list(read_bags(tmp_path))

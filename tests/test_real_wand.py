@@ -225,19 +225,6 @@ class Hand:
         return [one for one in made if one is not None]
 
 
-def test_a_gel_that_a_press_scratches_is_said(ramp: np.ndarray) -> None:
-    hand, press = Hand(ramp), [2.0, 4, 6, 8, 10, 12, 12, 12, 12, 12]
-    assert hand.feel(*[0.0] * 15) == []
-    assert len(hand.feel(*press, *[0.0] * 15)) == 1 and hand.recorder.gel_wear is None
-    hand.scratch = -20
-    (made,) = hand.feel(*press, *[0.0] * 15)
-    assert isinstance(made, WandTouch) and hand.recorder.gel_wear is not None
-    assert "the gel looks scratched" in str(hand.recorder.gel_wear)
-    assert "put on a new gel" in str(hand.recorder.gel_wear)
-    assert hand.recorder.counts == [0, 0, 2] and "press with 0 to 5 N" in hand.recorder.hint
-    assert len(hand.feel(*press, *[0.0] * 15)) == 1  # a worn gel goes on, if the person does
-
-
 def test_a_touch_that_does_not_count_is_said(ramp: np.ndarray) -> None:
     hand = Hand(ramp)
     hand.feel(*[0.0] * 15)

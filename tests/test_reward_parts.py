@@ -6,7 +6,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_episode_embedder import PaintTowers
+from toy_towers import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, WRIST
 from touchgoal.control.tactile.sensor_models import SENSORS

@@ -10,8 +10,9 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
-from test_episode_embedder import PaintTowers, recorded
+from test_episode_embedder import recorded
 from test_success import facts
+from toy_towers import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
 from touchgoal.episodes.media import write_video

@@ -77,14 +77,6 @@ def test_forward_process_has_the_schedules_statistics(predict: Any) -> None:
     assert noise.std().item() == pytest.approx(1, abs=0.02)
 
 
-def test_flow_goes_straight() -> None:
-    clean = torch.randn(50, 4, 2, generator=torch_rng())
-    config = SamplerConfig("flow", "velocity")
-    noisy, step, velocity = add_noise(config, clean, BatchNoise(torch_rng(1)))
-    left = 1 - step.view(-1, 1, 1) / FLOW_TIME_SCALE
-    torch.testing.assert_close(noisy + left * velocity, clean)
-
-
 def test_plans_start_from_noise_alone() -> None:
     assert inference_timesteps(SamplerConfig(num_inference_steps=4)).tolist() == [99, 74, 49, 24]
     assert alphas_cumprod(100)[-1] < 1e-4

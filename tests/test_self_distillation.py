@@ -25,7 +25,6 @@ from touchgoal.encoders.ssl.self_distillation import SelfDistillation
 from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.ssl.validation import token_statistics
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.encoders.training.trainer import OptimizerConfig, parameter_groups
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
@@ -86,16 +85,6 @@ def test_the_teacher_learns_by_averaging_alone(reads: str) -> None:
     for ours, theirs in zip(model.teacher.parameters(), oracle.module.parameters(), strict=True):
         torch.testing.assert_close(ours, theirs)
     assert not torch.equal(model.teacher.vit.norm.bias, model.backbone.vit.norm.bias)
-
-
-def test_weight_decay_goes_along_a_cosine_for_matrices_alone() -> None:
-    config = OptimizerConfig(5, 4, 1e-3, 0.04, final_weight_decay=0.4)
-    assert config.steps(10) == 10
-    assert config.decay(0, 10) == pytest.approx(0.04)
-    assert config.decay(5, 10) == pytest.approx(0.22)
-    assert config.decay(10, 10) == pytest.approx(0.4)
-    first, second = parameter_groups(toy_dino(), 0.04)
-    assert min(p.ndim for p in first["params"]) == 2 and second["weight_decay"] == 0
 
 
 def test_codes_of_places_do_not_hide_a_collapse() -> None:

@@ -15,7 +15,9 @@ from touchgoal.benchmarks.papers.tacbench.force import force_metrics
 from touchgoal.benchmarks.papers.tacbench.slip import f1_score, slip_metrics
 from touchgoal.benchmarks.papers.tacbench.task import split_force, split_slip
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
+from touchgoal.control.tactile.markers import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as MINI
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.encoders.preprocess import preprocessor_for
@@ -26,12 +28,15 @@ from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import RigConfig
-from touchgoal.sim_envs.indenter_rig import REST, shear_force, simulate
+from touchgoal.sim_envs.indenter_rig import REST, rig_unit, shear_force, simulate
 from touchgoal.sim_envs.object_slides import (
     FRAMES,
+    mean_radius,
     simulate_slide,
     stick_slip_force,
 )
+from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
+from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 
 RIG = RigConfig(seed=3)
 STROKES = 15
@@ -112,6 +117,30 @@ def test_a_slide_pulls_at_the_gel_up_to_the_cone() -> None:
     assert np.allclose(np.diff(slide.pose[: REST + 1], axis=0), 0)
     field = np.abs(slide.pose).max(0)
     assert (field < [3.6e-3, 3.6e-3, np.radians(31)]).all()
+
+
+def test_torsion_turns_the_dots_the_way_the_object_turns() -> None:
+    """An upright can: a disc, whose mean radius is two thirds of its own."""
+    unit, radius, load = rig_unit(RIG), 4e-3, 4.0
+    smooth = replace(CATALOGUE["glass_ball"], shape="cylinder")
+    bench = PressBench(Body(smooth, (radius, 4e-3), 0.1), MINI, unit)
+    bench.place(np.zeros(3))
+    depth, rng = -load / MINI.normal_stiffness, np.random.default_rng(0)
+    field = bench.sense(load, rng, depth=depth).field
+    assert field is not None
+    assert mean_radius(field) == pytest.approx(2 / 3 * radius, rel=0.05)
+    assert MINI.markers is not None
+    for torsion in (8e-3, -8e-3):
+        rest = bench.sense(0.0, rng).image
+        tracker = MarkerTracker(rest, MINI.markers, MINI.pixel_pitch)
+        tracker.update(bench.sense(load, rng, depth=depth).image)
+        before = tracker.displacement
+        tracker.update(bench.sense(load, rng, depth=depth, torsion=torsion).image)
+        moved, at = tracker.displacement - before, tracker.rest.positions
+        away = at - (np.array(rest.shape[1::-1]) - 1) / 2
+        under = np.linalg.norm(away, axis=-1) * MINI.pixel_pitch < 0.8 * radius
+        turns = (away[..., 0] * moved[..., 1] - away[..., 1] * moved[..., 0])[under]
+        assert np.sign(turns.mean()) == np.sign(torsion) and np.abs(turns).mean() > 5
 
 
 def test_an_object_is_seen_where_it_lies() -> None:
@@ -198,8 +227,3 @@ def test_the_benchmark_judges_every_encoder(
     for row in [*result["rows"], *shared_out]:
         row.pop("seconds", None)
     assert shared_out == [row for row in result["rows"] if row["task"] == "slip"]
-    plain = TouchBackboneConfig.for_sensor(PRESETS["tiny"], "gelsight_mini")
-    save(TouchBackbone(plain), tmp_path / "plain", {})
-    wrong = Config(encoders=(str(tmp_path / "plain"),), rig=RIG, data=strokes.parent)
-    with pytest.raises(UserError, match="the rig has gelsight_mini_markers"):
-        run(wrong)

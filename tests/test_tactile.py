@@ -239,17 +239,6 @@ def test_a_ball_lies_in_the_gel_as_deep_as_it_is_pressed() -> None:
     np.testing.assert_allclose(soft, deep / 2, atol=1e-9)
 
 
-def test_a_texture_turns_with_its_body() -> None:
-    """A ridge along y of the surface, turned by 90 degrees, lies along x of the image."""
-    ridge = SMOOTH.copy()
-    ridge[:, 126:131] = 1e-4
-    surface = Surface("flat", 1e-2, 1.0, ridge, 1.0)
-    for turn, axis in ((0.0, 0), (np.pi / 2, 1)):
-        high = overlap(surface, replace(LEVEL, turn=turn), SHAPE, PITCH) > 0.45e-3
-        spread = np.ptp(np.argwhere(high), axis=0)
-        assert spread[axis] > 60 and spread[1 - axis] < 10
-
-
 def test_an_encoder_fitted_to_surfaces_comes_back(tmp_path: Path) -> None:
     encoder = train(GELSIGHT_MINI, "gelsight_mini", WhiteningConfig(surfaces=16, presses=2))
     save(encoder, tmp_path, {"data": "simulated"}, half=False)

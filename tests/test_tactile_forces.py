@@ -12,7 +12,6 @@ from touchgoal.sim_envs.tactile.geometry import NO_SURFACE, Grid
 from touchgoal.sim_envs.tactile.markers import (
     GelMotion,
     layer_compliance,
-    rest_positions,
 )
 from touchgoal.sim_envs.tactile.press import press_until_balanced
 from touchgoal.sim_envs.tactile.shear_relief import ShearRelief
@@ -213,11 +212,3 @@ def test_the_gel_piles_up_in_front_of_what_is_drawn_over_it() -> None:
     np.testing.assert_allclose(still, 0, atol=1e-12)
     held = relief(field, np.ones((GRID.rows, GRID.columns), np.float32))
     assert not held.any()
-
-
-def test_markers_rest_inside_the_image() -> None:
-    assert MINI.markers is not None
-    rest = rest_positions(MINI.markers, (240, 320), MINI.pixel_pitch)
-    assert len(rest) == 63
-    np.testing.assert_allclose(rest.mean(0), [159.5, 119.5], atol=1e-3)
-    assert len(rest_positions(MINI.markers, (240, 250), MINI.pixel_pitch)) == 7 * 7

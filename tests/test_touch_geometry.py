@@ -149,16 +149,6 @@ def test_a_gel_without_its_markers_is_refused() -> None:
             find_markers(image, DOTS, MINI.pixel_pitch)
 
 
-def test_painting_markers_over_gives_the_plain_gel(gel: SensorInstance) -> None:
-    plain = press(Body(GLASS, (0.01,), 0.1), 2.0).image
-    painted = without_markers(dotted(plain, gel), gel.markers, gel.marker_radius)
-    changed = (painted != plain).any(2)
-    error = np.abs(painted.astype(float) - plain)[changed]
-    noise = gel.calibration.noise  # of the plain picture
-    assert changed.mean() > 0.15
-    assert error.mean() < noise and np.quantile(error, 0.99) < 4 * noise
-
-
 @pytest.mark.parametrize("seed", [6, 56, 70])  # 70: dots a fifth larger in the picture
 def test_dots_of_another_unit_are_painted_out_whole(seed: int) -> None:
     """Rims left over look like a touch, and `deploy` refuses."""

@@ -1,7 +1,6 @@
 """The twin's Franka control interface, through libfranka, and its limits."""
 
 import time
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -144,59 +143,6 @@ def test_franka_grasps_what_is_there(fr3: RunningTwin) -> None:
     assert abs(truth["width"] - result["width"]) < 1e-4
     assert abs(result["force"][2] - 0.1 * 9.81) < 0.1  # the robot holds it up: the maker's sign
     assert result["took"] > 0.5 * (0.08 - result["width"]) / 0.04  # it keeps to the speed asked for
-
-
-def suffers(address: str, home: list[float]) -> dict:
-    """Moves slowly until something happens; says what, and whether the arm goes on afterwards."""
-    import franky
-
-    robot = connect(address)
-    robot.set_collision_behavior([20.0] * 7, [20.0] * 6)
-    error_message, speed = "", [0.05, 0, 0, 0, 0, 0, 0]
-    try:
-        robot.move(franky.JointVelocityMotion(speed, franky.Duration(20_000)))
-    except franky.ControlException as error:
-        error_message = str(error)
-    mode = robot.state.robot_mode.name
-    try:
-        robot.move(franky.JointVelocityMotion(speed, franky.Duration(100)))
-        rejected = ""
-    except (franky.CommandException, franky.ControlException) as error:
-        rejected = str(error)
-    try:
-        recovered = robot.recover_from_errors()
-    except franky.CommandException:
-        recovered = False
-    if recovered:
-        robot.relative_dynamics_factor = 0.5
-        robot.move(franky.JointMotion(home))
-    return {"error": error_message, "mode": mode, "rejected": rejected, "recovered": recovered}
-
-
-@pytest.mark.realtime
-@pytest.mark.parametrize(
-    ("fault", "error", "mode", "recovers"),
-    [
-        ("nudge 0 60 0 0.3", "cartesian_reflex", "Reflex", True),
-        ("error joint_reflex", "joint_reflex", "Reflex", True),
-        ("freeze 0.3", "communication_constraints_violation", "Reflex", True),
-        ("stop-button on", "safety function", "UserStopped", False),
-    ],
-)
-def test_franka_stops_for_a_fault(
-    fr3: RunningTwin, fault: str, error: str, mode: str, recovers: bool
-) -> None:
-    fr3.begin("reset 3")
-    with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(through_franky, suffers, fr3)
-        while fr3.ask("truth")["rest"] > 0 and not running.done():
-            time.sleep(0.02)
-        fr3.ask(fault)
-        result = running.result()
-    fr3.ask("stop-button off")
-    assert error in result["error"] and result["mode"] == mode
-    assert "rejected" in result["rejected"] and result["recovered"] == recovers
-    assert fr3.at_rest()["worst"]["excess"] <= 0
 
 
 @pytest.mark.parametrize("joint", range(7))

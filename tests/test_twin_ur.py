@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from running_twin import RunningTwin, client, yaw_of
+from running_twin import RunningTwin, client
 
 pytestmark = pytest.mark.realtime
 
@@ -65,52 +65,3 @@ def test_ur_moves_servoes_and_watches(ur5e: RunningTwin) -> None:
     np.testing.assert_allclose(result["line"], [0, 0, -0.05], atol=2e-3)
     assert result["kicked"] and not result["silent"]
     assert ur5e.ask("truth")["worst"]["excess"] <= 0
-
-
-def places(address: str, port: str, pick: list[float], place: list[float], yaw: float) -> dict:
-    """Picks and places through ur-rtde, with the gripper's registers by minimalmodbus."""
-    import minimalmodbus
-    from rtde_control import RTDEControlInterface
-
-    control = RTDEControlInterface(address)
-    gripper = minimalmodbus.Instrument(port, 9)
-    assert gripper.serial
-    gripper.serial.timeout = 0.5  # s
-
-    def grip(position: int) -> int:
-        gripper.write_registers(1000, [0x0900, position, 255 << 8 | 20])
-        deadline = time.monotonic() + 10
-        while time.monotonic() < deadline:
-            if found := gripper.read_registers(2000, 3, functioncode=4)[0] >> 14:
-                return found  # no longer moving
-            time.sleep(0.05)
-        return 0
-
-    # Pointing down, turned by yaw: half a turn about an axis in the table's plane.
-    down = [np.pi * np.cos(yaw / 2), np.pi * np.sin(yaw / 2), 0.0]
-
-    def go(position: list[float], height: float, speed: float) -> None:
-        control.moveL([*position[:2], position[2] + height, *down], speed, 1.0)
-
-    result = {"air": grip(3)}
-    go(pick, 0.12, 0.5)
-    go(pick, 0.0, 0.2)
-    result["object"] = grip(230)
-    go(pick, 0.12, 0.3)
-    go(place, 0.12, 0.3)
-    go(place, 0.0, 0.1)
-    time.sleep(1.0)
-    return result
-
-
-def test_ur_picks_and_places(ur5e: RunningTwin) -> None:
-    ur5e.begin('reset 7 {"object": "wooden_block", "mass": 0.1}')
-    layout = ur5e.ask("truth")["layout"]
-    height = max(layout["object"][2], 0.0185)
-    pick, place = [*layout["object"][:2], height], [*layout["goal"], height]
-    result = client(
-        places, ur5e.cell.address, ur5e.cell.gripper.port, pick, place, yaw_of(layout["object"])
-    )
-    assert result == {"air": 3, "object": 2}
-    truth = ur5e.ask("truth")
-    assert truth["success"] and truth["progress"] == 1
