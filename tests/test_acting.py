@@ -24,10 +24,7 @@ from touchgoal.encoders.pretrained import find_encoder
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES
-from touchgoal.policies.evaluation.open_loop import (
-    open_loop_errors,
-    zero_motion,
-)
+from touchgoal.policies.evaluation.open_loop import open_loop_errors, zero_motion
 from touchgoal.policies.network import ObservationBatch, PolicyNetwork
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.training.sequence_dataset import Recordings, SequenceDataset

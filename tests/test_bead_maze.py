@@ -63,27 +63,6 @@ def test_wires_are_sound_and_differ(family) -> None:
     assert wires.distance(wires.shape(turned), shapes[:1]) < 1e-6
 
 
-def test_more_wires_begin_with_the_same() -> None:
-    few, many = choose("training", 10), choose("training", 30)
-    assert [w.name for w in few] == [w.name for w in many[:10]]
-    assert {w.family for w in many} == set(FAMILIES) - {wires.HELD_OUT}
-
-
-def test_projection_and_chords() -> None:
-    wire = find("fourier-3").moved(np.array([0.5, 0.0, 0.2]), 0.3)
-    for s in (0.0, 0.123, 0.31, LENGTH):
-        point, tangent = wire.at(s)
-        aside = np.cross(tangent, [0, 0, 1.0])
-        assert wire.project(point + 1e-3 * aside, s - 0.004) == pytest.approx(s, abs=2e-4)
-    chords = wire.chords(sag=6e-5, longest=0.012)
-    np.testing.assert_array_equal(chords[1:, 0], chords[:-1, 1])
-    np.testing.assert_array_equal(chords[[0, -1], [0, 1]], wire.points[[0, -1]])
-    s = 0.0
-    for middle in chords.mean(axis=1):
-        s = wire.project(middle, s + 0.004)
-        assert np.linalg.norm(middle - wire.at(s)[0]) < 1e-4
-
-
 @pytest.mark.parametrize(("degrees", "slides"), [(9.5, False), (14.0, True)])
 def test_bead_slides_as_coulomb_says(degrees: float, slides: bool) -> None:
     """Friction 0.2 holds on slopes up to 11.3 degrees."""

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from touchgoal.control.calibration.ball import ball_overlap, press_surface, sphere_in
+from touchgoal.control.calibration.ball import ball_overlap, press_surface
 from touchgoal.control.calibration.calibrate import fit, median_background
 from touchgoal.control.calibration.press_fit import FitState, PressFit
 from touchgoal.control.calibration.press_set import (
@@ -249,15 +249,6 @@ def test_light_that_drifts_from_press_to_press_is_taken_out() -> None:
     brighter = np.rint(image * np.array([1.05, 0.97, 1.02]) + [2, 0, -3]).clip(0, 255)
     steady = without_drift(brighter.astype(np.uint8), press.background, press.circles[0])
     assert np.abs(steady.astype(float) - image).mean() < 1.0
-
-
-def test_a_sphere_is_read_from_a_depth_map() -> None:
-    rows, columns = np.mgrid[:120, :160]
-    square = ((columns - 82) ** 2 + (rows - 60) ** 2) * PITCH**2
-    depth = (np.sqrt(np.maximum(9e-6 - square, 0)) - 2.7e-3).astype(np.float32)
-    seen = sphere_in(depth, PITCH, np.array([80.0, 60.0, 10.0]), 2.5e-3)
-    assert seen.radius == pytest.approx(3 / 2.5, rel=1e-3)
-    assert seen.residual < 1e-6
 
 
 def test_a_background_is_filled_in_without_a_seam() -> None:

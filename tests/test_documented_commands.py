@@ -31,14 +31,14 @@ from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.control.tactile import sensor_models
 from touchgoal.episodes.media import write_video
+from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import COMMANDS, read_options
 from touchgoal.launch.deploy import NOT_DONE
 from touchgoal.runtime.worker_pool import one_core_workers
 
 Shell = Callable[[list[str]], int]
 ALL = list(commands())
-# own_*.md: test_own_pages.py
-SNIPPET_PAGES = [p for p in PAGES if snippets(p) and not p.stem.startswith("own_")]
+SNIPPET_PAGES = [page for page in PAGES if snippets(page)]
 SHELL = [sys.executable, "-m", "touchgoal.launch"]
 
 
@@ -204,9 +204,16 @@ def _serve(words: list[str], cell_file: Path) -> "subprocess.Popen[bytes]":
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", SNIPPET_PAGES, ids=lambda page: page.name)
-def test_snippets_run(page: Path, desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_snippets_run(
+    page: Path, desk: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.syspath_prepend(str(desk))
+    monkeypatch.setattr(sensor_models, "SENSORS", dict(sensor_models.SENSORS))  # a page adds one
     for i, code in enumerate(snippets(page)):
         program = desk / f"snippet_{i}.py"
         program.write_text(code.replace("n_steps=512", "n_steps=16").replace("100_000", "16"))
         runpy.run_path(str(program))
+    if page.stem == "own_task":
+        episodes = EpisodeSet(desk / "my_episodes")
+        assert [episodes.meta(i)["success"] for i in range(len(episodes))] == [True, True]
+    assert page.stem != "own_policy" or "0/2 [0.00, 0.66]" in capsys.readouterr().out

@@ -18,7 +18,7 @@ from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.infonce import info_nce, symmetric_info_nce
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
-from touchgoal.encoders.backbones.vit import PRESETS, ViT, random_masking
+from touchgoal.encoders.backbones.vit import PRESETS, ViT
 from touchgoal.encoders.preprocess import PREPROCESSORS, check_images
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import portable
@@ -94,14 +94,6 @@ def test_kept_patches_are_all_that_is_seen() -> None:
     torch.testing.assert_close(vit(changed, ids_keep), vit(images, ids_keep))
     changed[:, :, 40:80, 40:80] = 9  # patch 5
     assert not torch.allclose(vit(changed, ids_keep), vit(images, ids_keep))
-
-
-def test_random_masks_are_distinct_and_seeded() -> None:
-    seeds = (torch.Generator().manual_seed(1) for _ in range(2))
-    one, again = (random_masking(PRESETS["tiny"], 0.5, 50, seed) for seed in seeds)
-    assert one.shape == (50, 6) and torch.equal(one, again)
-    assert all(len(set(row)) == 6 for row in one.tolist())
-    assert set(one.flatten().tolist()) == set(range(12))
 
 
 # ---- InfoNCE

@@ -142,23 +142,19 @@ def test_refusals_say_what_to_do(small: Path) -> None:
             refuse(small)
 
 
-def add_episodes_like_lerobot(root: Path, extend: bool) -> None:
-    """Add two episodes to three of 7 frames as lerobot 0.4 (`extend` the last files) or 0.6 does."""
+def add_episodes_like_lerobot(root: Path) -> None:
+    """Add two episodes to three of 7 frames by extending the last files."""
     extra = root.with_name("extra")
     record(extra, range(3, 5))
-    tables = [pq.read_table(extra / set_files.data_path(i)) for i in range(2)]
-    wrist = [EpisodeSet(extra).read(i, [ft.WRIST]).frames[ft.WRIST] for i in range(2)]
-    file = 2 if extend else 3
-    if extend:
-        tables.insert(0, pq.read_table(root / set_files.data_path(2)))
-        wrist.insert(0, EpisodeSet(root).read(2, [ft.WRIST]).frames[ft.WRIST])
+    files = ((root, 2), (extra, 0), (extra, 1))
+    tables = [pq.read_table(folder / set_files.data_path(i)) for folder, i in files]
+    wrist = [EpisodeSet(folder).read(i, [ft.WRIST]).frames[ft.WRIST] for folder, i in files]
     table = pa.concat_tables([t.replace_schema_metadata(None) for t in tables])
-    first = 35 - len(table)
-    index = np.arange(first, 35)
+    index = np.arange(14, 35)
     for key, values in (("index", index), ("episode_index", index // 7)):
         table = table.set_column(table.column_names.index(key), key, pa.array(values))
-    pq.write_table(table, root / set_files.data_path(file), compression="snappy")
-    write_video(root / set_files.video_path(ft.WRIST, file), np.concatenate(wrist), FPS)
+    pq.write_table(table, root / set_files.data_path(2), compression="snappy")
+    write_video(root / set_files.video_path(ft.WRIST, 2), np.concatenate(wrist), FPS)
     own = pq.read_table(root / set_files.EPISODES).to_pylist()
     added = [
         {
@@ -167,25 +163,21 @@ def add_episodes_like_lerobot(root: Path, extend: bool) -> None:
             "tasks": [f"lift the {i % 2}"],
             "dataset_from_index": 7 * i,
             "dataset_to_index": 7 * (i + 1),
-            "data/file_index": file,
-            f"videos/{ft.WRIST}/file_index": file,
-            f"videos/{ft.WRIST}/from_timestamp": (7 * i - first) / FPS,
-            f"videos/{ft.WRIST}/to_timestamp": (7 * (i + 1) - first) / FPS,
+            f"videos/{ft.WRIST}/from_timestamp": (7 * i - 14) / FPS,
+            f"videos/{ft.WRIST}/to_timestamp": (7 * (i + 1) - 14) / FPS,
             f"videos/{ft.WRIST}/crc32": None,
         }
         for i in (3, 4)
     ]
-    name = set_files.EPISODES if extend else set_files.EPISODES.replace("file-000", "file-001")
-    pq.write_table(pa.Table.from_pylist([*own, *added] if extend else added), root / name)
+    pq.write_table(pa.Table.from_pylist([*own, *added]), root / set_files.EPISODES)
     info = json.loads((root / set_files.INFO).read_text())
     info |= {"total_episodes": 5, "total_frames": 35, "splits": {"train": "0:5"}}
     (root / set_files.INFO).write_text(json.dumps(info))
 
 
-@pytest.mark.parametrize("extend", [False, True])
-def test_a_set_that_lerobot_continued_is_left_as_it_is(small: Path, extend: bool) -> None:
+def test_a_set_that_lerobot_continued_is_left_as_it_is(small: Path) -> None:
     """It is read; its episodes are sound, if not ours: nothing moves, no message advises `repair`."""
-    add_episodes_like_lerobot(small, extend)
+    add_episodes_like_lerobot(small)
     before = {path: path.read_bytes() for path in small.rglob("*") if path.is_file()}
     episodes = EpisodeSet(small)
     for i in range(5):

@@ -61,12 +61,6 @@ def test_a_gel_seen_at_an_angle_is_shown_from_above(scale: float) -> None:
         assert area == pytest.approx(np.pi * 100, rel=0.1)
 
 
-def test_a_whole_picture_is_its_own_rectified() -> None:
-    picture = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
-    whole = ((-0.5, -0.5), (319.5, -0.5), (-0.5, 239.5), (319.5, 239.5))
-    np.testing.assert_array_equal(rectify(picture, SHAPE, whole), picture)
-
-
 def test_corners_of_no_gel_are_refused() -> None:
     for says, corners in {
         "outside": ((0.0, 0.0), (700.0, 0.0), (0.0, 400.0), (600.0, 400.0)),

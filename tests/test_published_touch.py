@@ -74,15 +74,6 @@ def test_touch_and_go_has_red_and_blue_put_back(tmp_path: Path) -> None:
     assert read_recordings(tmp_path, "gelsight")[0].sensor == "gelsight"
 
 
-def test_object_folder_is_a_mini(tmp_path: Path) -> None:
-    for i in (1, 2, 3):
-        write(tmp_path / f"{i:03d}.pkl", [encoded(gel(i, (240, 320)))])
-    recordings = read_recordings(tmp_path)
-    assert [r.sensor for r in recordings] == 3 * ["gelsight_mini"]
-    assert [r.held_out for r in recordings] == [False, False, True]
-    assert near(recordings[2].open()[0].frames([0])[0], gel(3, (240, 320)))
-
-
 def test_touches_are_drawn_with_those_before_them(tmp_path: Path) -> None:
     write_slides(tmp_path, ("mug",))
     recordings = read_recordings(tmp_path)[1:3]

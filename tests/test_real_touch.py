@@ -12,7 +12,7 @@ import torch
 from touchgoal.benchmarks.real_touch import forces, markers
 from touchgoal.benchmarks.real_touch.embedders import find_embedder
 from touchgoal.benchmarks.real_touch.forces import EmbeddedGrasp, cost_table, judge_cost
-from touchgoal.benchmarks.real_touch.videos import Config, embed_touch, read_touch, run
+from touchgoal.benchmarks.real_touch.videos import Config, run
 from touchgoal.control.tactile.force import calibrate_force, change_statistics, resized
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import load_encoder
@@ -114,21 +114,6 @@ def test_sentences_lie_where_what_they_tell_of_is_felt() -> None:
     words = [w[r] for w, r in zip(RANK_WORDS, (0, 2, 1), strict=True)]
     whole = towers.embed_texts([f"a {word} object" for word in words])
     assert (head(whole).sum(0) @ centred.T).argmax() == np.flatnonzero(unseen)[0]
-
-
-def test_the_past_of_a_chosen_frame_is_that_of_its_video(clips: Path) -> None:
-    video = read_labelled_videos(clips)[0]
-    frames, asked = video.frames(), []
-
-    def embed(frames: np.ndarray, background: np.ndarray, rows: np.ndarray | None = None):
-        asked.append((len(frames), rows))
-        return np.zeros((len(frames) if rows is None else len(rows), 1), np.float32)
-
-    touch = read_touch(video, frames)
-    embed_touch(touch, frames, embed)
-    (whole, rows), *alone = asked
-    assert whole == 9 and rows.tolist()[1:] == [5, 6, 7, 8]  # pressed from the sixth on
-    assert alone == [(1, None)] * 2  # an untouched frame and a brighter one have no common past
 
 
 def test_the_benchmark_takes_a_hugging_face_model(tmp_path: Path) -> None:

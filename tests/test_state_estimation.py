@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_policies import TOY, torch_rng, toy_dataset, toy_observations, toy_policy
+from toy_policies import TOY, torch_rng, toy_dataset, toy_policy
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.episodes.recording import CORRECTED, EpisodeSpec, record_episode
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig
 from touchgoal.policies.perception.placements import Placements
@@ -21,7 +20,6 @@ from touchgoal.policies.perception.pose_training import pose_errors, train_pose_
 from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.perception.state_estimation import ESTIMATED, StateEstimator
 from touchgoal.policies.training.dagger import DaggerRoles
-from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace
@@ -88,18 +86,6 @@ def test_a_place_is_learnt(tmp_path: Path) -> None:
 
 SEES = (ft.STATE, ft.TCP_POSE, *ESTIMATED)
 ESTIMATING = replace(TOY, touch_dim=0, touch="", proprioception=SEES, position_noise=0.0)
-
-
-def test_a_policy_acts_on_its_senses() -> None:
-    policy = toy_policy(ESTIMATING, toy_dataset(ESTIMATING)).eval()
-    ticks = toy_observations(3)
-    for tick in ticks:
-        tick[ft.FRONT] = np.zeros((16, 16, 3), np.uint8)
-    with pytest.raises(UserError, match=r"truth\.contact"):
-        LearnedPolicy(policy, None)
-    planner = LearnedPolicy(policy, None, toy_estimator())
-    plans = [planner.plan(ticks[i : i + 2]) for i in range(2)]
-    assert plans[0].shape == (ESTIMATING.prediction_horizon, 8) and np.isfinite(plans).all()
 
 
 def test_a_rearrangement_is_a_beginning() -> None:

@@ -29,12 +29,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import REST, rig_unit, shear_force, simulate
-from touchgoal.sim_envs.object_slides import (
-    FRAMES,
-    mean_radius,
-    simulate_slide,
-    stick_slip_force,
-)
+from touchgoal.sim_envs.object_slides import FRAMES, mean_radius, simulate_slide, stick_slip_force
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 

@@ -1,16 +1,13 @@
 """Simulated tactile pictures: what they show, sensor by sensor; random surfaces and their encoder."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from touchgoal.control.tactile.sensor_calibration import load, shade
-from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, GELSIGHT_MINI, SensorModel
+from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, SensorModel
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI as MINI
-from touchgoal.encoders.pretrained import load_encoder, save
-from touchgoal.encoders.whitening.simulated_surfaces import WhiteningConfig, train
 from touchgoal.sim_envs.config import NO_RANDOMIZATION, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
@@ -27,8 +24,8 @@ from touchgoal.sim_envs.tactile.geometry import (
 from touchgoal.sim_envs.tactile.optics import colour_change, render, render_untouched
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
-from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, overlap, press
-from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface, random_surface
+from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, overlap
+from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
 INSTANCE = sample_instance(MINI, np.random.default_rng(0), NO_RANDOMIZATION)
@@ -237,15 +234,3 @@ def test_a_ball_lies_in_the_gel_as_deep_as_it_is_pressed() -> None:
     assert rim == pytest.approx(np.sqrt(2 * 5e-3 * 0.5e-3), rel=0.02)
     soft = overlap(replace(ball, firmness=0.5), LEVEL, SHAPE, PITCH)
     np.testing.assert_allclose(soft, deep / 2, atol=1e-9)
-
-
-def test_an_encoder_fitted_to_surfaces_comes_back(tmp_path: Path) -> None:
-    encoder = train(GELSIGHT_MINI, "gelsight_mini", WhiteningConfig(surfaces=16, presses=2))
-    save(encoder, tmp_path, {"data": "simulated"}, half=False)
-    loaded = load_encoder(tmp_path)
-    rng = np.random.default_rng(1)
-    unit = sample_instance(GELSIGHT_MINI, rng)
-    frames = np.stack([render_untouched(unit, rng), press(random_surface(rng), LEVEL, unit, rng)])
-    embedded = loaded.embed(frames)
-    assert np.linalg.norm(embedded[1]) == pytest.approx(1, abs=0.02)
-    np.testing.assert_allclose(embedded, encoder.embed(frames), atol=1e-4)

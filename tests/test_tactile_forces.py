@@ -9,10 +9,7 @@ from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as MIN
 from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.tactile.forces import ForceField, force_field
 from touchgoal.sim_envs.tactile.geometry import NO_SURFACE, Grid
-from touchgoal.sim_envs.tactile.markers import (
-    GelMotion,
-    layer_compliance,
-)
+from touchgoal.sim_envs.tactile.markers import GelMotion, layer_compliance
 from touchgoal.sim_envs.tactile.press import press_until_balanced
 from touchgoal.sim_envs.tactile.shear_relief import ShearRelief
 

@@ -18,12 +18,7 @@ from touchgoal.encoders.ssl.config import MaeConfig
 from touchgoal.encoders.ssl.mae import MaskedAutoencoder
 from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.encoders.training.trainer import (
-    OptimizerConfig,
-    Training,
-    fit,
-    parameter_groups,
-)
+from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, parameter_groups
 from touchgoal.launch import train_encoder
 from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.heads.mlp import MLPConfig
@@ -103,9 +98,7 @@ test_trainer.train_everything(Path(sys.argv[1]))
 def trainings() -> dict[str, Callable[[Path], object]]:
     """Every trainer at toy size, two epochs of a few steps each, given a folder."""
     import test_align
-    import test_jepa
-    import test_mae
-    import test_self_distillation
+    import test_self_supervision
     import test_state_estimation
     import toy_policies
     from toy_touches import moving_blobs
@@ -113,10 +106,10 @@ def trainings() -> dict[str, Callable[[Path], object]]:
     fresh: tuple[TrainerOptions, dict] = TrainerOptions(), {}
     short = {"epochs": 2, "lr": 0.1, "batch_size": 8}
     unlabelled = {
-        "mae": (test_mae.blobs(16, 0), test_mae.TOY),
-        "dino": (moving_blobs(16), replace(test_self_distillation.TOY, batch_norm=True)),
-        "ijepa": (moving_blobs(16), test_jepa.ITOY),
-        "vjepa": (moving_blobs(16, frames=4), test_jepa.VTOY),
+        "mae": (test_self_supervision.blobs(16, 0), test_self_supervision.MAE),
+        "dino": (moving_blobs(16), replace(test_self_supervision.DINO, batch_norm=True)),
+        "ijepa": (moving_blobs(16), test_self_supervision.IJEPA),
+        "vjepa": (moving_blobs(16, frames=4), test_self_supervision.VJEPA),
     }
 
     def without_labels(name: str, out: Path) -> None:

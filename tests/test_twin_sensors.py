@@ -3,12 +3,10 @@
 import socket
 from typing import Literal
 
-import cv2
 import mujoco
 import numpy as np
 import pytest
 import serial
-from numbered_pictures import until
 from running_twin import RunningTwin
 
 from touchgoal.control.sensors.load_cell import parse
@@ -65,28 +63,6 @@ def test_fixture_waits_for_the_first_grasp() -> None:
         cell.step()
     assert not cell.env.data.eq_active[fixture] and not cell.failures
     np.testing.assert_allclose(cell.truth()["pad_forces"], 10.0, rtol=0.05)
-
-
-def test_pictures_come_freeze_and_stop(fr3: RunningTwin) -> None:
-    name = "tactile_left"
-    assert fr3.cell.fingertips is not None
-    url = fr3.cell.fingertips.left
-    capture = cv2.VideoCapture(url)
-    frames = [capture.read()[1] for _ in range(3)]
-    assert frames[0].shape == (240, 320, 3) and not np.array_equal(frames[1], frames[2])
-    # Pictures are taken and served by a process of their own, which hears of a fault after what it is at.
-    fr3.ask(f"repeat {name} 60")
-    until(lambda: np.array_equal(capture.read()[1], capture.read()[1]))
-    np.testing.assert_array_equal(capture.read()[1], capture.read()[1])
-    fr3.ask(f"repeat {name} 0")
-    fr3.ask(f"lose {name} 60")
-    while capture.read()[0]:
-        pass
-    assert not cv2.VideoCapture(url).isOpened()
-    fr3.ask(f"lose {name} 0")
-    until(lambda: cv2.VideoCapture(url).read()[0])
-    front = cv2.VideoCapture(fr3.cell.cameras["front"].source).read()[1]
-    assert front.shape == (256, 256, 3) and front.std() > 10
 
 
 def test_load_cell_weighs_is_garbled_and_unplugged(fr3: RunningTwin) -> None:

@@ -2,7 +2,7 @@
 
     python tests/interop/run.py [NAME ...]      NAME: pylibfranka, franka-sim, franky-sim; none: all
 
-franky and ur-rtde drive the twin in test_twin_franka.py and test_twin_ur.py.
+franky and ur-rtde drive the twin in test_twin_clients.py.
 
 What is not ours runs in the virtual environment `.venv-interop` (`make interop` makes it), each in a process
 of its own. It prints what each one found, and fails if that is wrong.
