@@ -60,7 +60,7 @@ def main(config: Config) -> None:
     from touchgoal.episodes.keys import use_keys
     from touchgoal.episodes.schema import Episode, joined
     from touchgoal.rewards.demonstration_costs import accepted_failures, last_costs
-    from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, start_and_end
+    from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
     from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
     from touchgoal.rewards.reward_model import load_embedder
@@ -87,11 +87,8 @@ def main(config: Config) -> None:
                 f"{len(trajectories)} successes to fit on"
             )
     out = open_run(config.out, "fit-normalizer", config)
-    whole = config.value or config.success_from
     embedded = [
-        embedder.embed_chunks(
-            t.chunks() if whole else start_and_end(t.chunks()), t.fps, t.source, descriptions=True
-        )
+        embedder.embed_chunks(t.chunks(), t.fps, t.source, descriptions=True)
         for t in track(trajectories, "embedding", "trajectory")
     ]
     calibration = embedded[len(embedded) - config.success_from :]

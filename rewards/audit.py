@@ -16,7 +16,6 @@ from touchgoal.encoders.probes.bootstrap import mean_interval, percentile_interv
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.parts import FUSED
-from touchgoal.rewards.features.contact_reading import ContactReadings
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.metrics import auc, measure_curve
 from touchgoal.rewards.reward_model import RewardModel
@@ -209,14 +208,7 @@ def _with_touch(
     sides: Int[np.ndarray, " s"],
 ) -> EmbeddedEpisode:
     """Return an episode with touch and contact readings from rows and sides of a source."""
-    readings = source.readings
-    if readings is not None:
-        taken = readings.take(rows)
-        readings = ContactReadings(
-            taken.touching[sides],
-            None if taken.force is None else taken.force[sides],
-            None if taken.centre is None else taken.centre[sides],
-        )
+    readings = None if source.readings is None else source.readings.take(rows).of_sides(sides)
     return replace(episode, touch=source.touches()[sides][:, rows], readings=readings)
 
 

@@ -15,7 +15,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.features import FRONT, TRUTH_CONTACT
+from touchgoal.control.features import FRONT, TRUTH_CONTACT, WRENCH
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.metrics import START_FRAMES
@@ -118,7 +118,7 @@ class EpisodeEnd:
     def read(self, keys: Sequence[str]) -> Episode:
         """Return the first frames (for the background of touch) and, last, the last frame.
 
-        The simulator's contact is added where it is recorded. UserError: no such set, episode or
+        The simulator's contact and the wrench are added where they are recorded. UserError: no such set, episode or
         key.
         """
         episodes = EpisodeSet(self.root)
@@ -127,9 +127,9 @@ class EpisodeEnd:
                 f"goal '{self}' does not exist: {self.root} has episodes 0 to {len(episodes) - 1}"
             )
         length = episodes.lengths[self.index]
-        truth = [TRUTH_CONTACT] if TRUTH_CONTACT in episodes.features else []
+        more = [key for key in (TRUTH_CONTACT, WRENCH) if key in episodes.features]
         frames = [*range(min(START_FRAMES, length)), length - 1]
-        return episodes.read(self.index, [*keys, *truth], frames)
+        return episodes.read(self.index, [*keys, *more], frames)
 
 
 @dataclass(frozen=True)

@@ -166,11 +166,11 @@ def test_a_press_is_read_where_and_how_hard_it_is() -> None:
     pressed = gel.astype(np.float32)
     pressed[..., 0] += 60 * np.gradient(ball, axis=1) / np.abs(np.gradient(ball, axis=1)).max()
     frames = np.stack([gel] * 6 + [np.clip(pressed, 0, 255).astype(np.uint8)] * 3)
-    readings = ContactReader(SENSORS["gelsight_mini"], frames[:5]).read(frames)
+    readings = ContactReader(SENSORS["gelsight_mini"], frames[:5], 20.0).read(frames)
     assert readings.touching[0].tolist() == [False] * 6 + [True] * 3
     assert readings.force is not None and readings.centre is not None
     assert readings.force[0, :6].tolist() == [0] * 6 and readings.force[0, -1] > 0
-    blind = ContactReader(None, frames[:5]).read(frames)
+    blind = ContactReader(None, frames[:5], 20.0).read(frames)
     assert blind.touching.tolist() == readings.touching.tolist() and blind.force is None
 
 

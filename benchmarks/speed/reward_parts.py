@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from touchgoal.benchmarks.speed.rates import in_turn
-from touchgoal.control.features import CAMERA_SHAPE, CAMERAS, TACTILE_SHAPE
+from touchgoal.control.features import CAMERA_SHAPE, CAMERAS, CONTROL_HZ, TACTILE_SHAPE
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.encoders.towers.towers import OfflineTowers
 from touchgoal.rewards.features.contact_reading import ContactReader
@@ -22,7 +22,7 @@ def time_parts(repeats: int) -> dict[str, float]:
     gel = rng.integers(108, 112, (6, *TACTILE_SHAPE), np.uint8)
     pressed = gel[:1].copy()
     pressed[:, 100:140, 140:180, 0] += 60
-    towers, reader = OfflineTowers(), ContactReader(GELSIGHT_MINI, gel[:5])
+    towers, reader = OfflineTowers(), ContactReader(GELSIGHT_MINI, gel[:5], CONTROL_HZ)
     maps = towers.embed_with_maps(picture)[1]
     value = Value(ValueConfig("", CAMERAS, "offline", maps.shape[1:], 0)).eval()
     stacked = torch.from_numpy(maps).float().flatten(2)[:, None].expand(-1, len(CAMERAS), -1, -1)

@@ -1,12 +1,10 @@
 """Fitting of a `DistanceNormalizer` on successful episodes, of any camera and any lab."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.episodes.schema import Episode
 from touchgoal.rewards.distance.embedding_distance import (
     text_distances,
     touch_distances,
@@ -62,47 +60,27 @@ def fit_normalizer(
     )
 
 
-def start_and_end(chunks: Iterable[Episode]) -> Iterator[Episode]:
-    """Yield the frames of a trajectory that a normalizer is fitted on: its first 5 and last 6."""
-    start, end = None, None
-    for chunk in chunks:
-        start = start or _rows(chunk, slice(START_FRAMES))
-        both = chunk if end is None else _joined(end, chunk)
-        end = _rows(both, slice(-1 - END_FRAMES, None))
-    if start is not None and end is not None:
-        yield _joined(start, end)
-
-
-def _rows(episode: Episode, rows: slice) -> Episode:
-    return replace(episode, frames={key: v[rows] for key, v in episode.frames.items()})
-
-
-def _joined(one: Episode, other: Episode) -> Episode:
-    frames = {key: np.concatenate([v, other.frames[key]]) for key, v in one.frames.items()}
-    return replace(one, frames=frames)
-
-
 def fit_units(episodes: Sequence[EmbeddedEpisode]) -> dict[str, float]:
     """Return the unit of each part: the 90 % quantile of its distance between two successful ends.
 
-    Ends with the same object are compared; empty if no two share one.
+    Ends with the same object are compared, and the mean over the objects is taken: one that is held
+    a little differently each time does not set the unit of all. Empty if no two share an object.
     """
     by_object: dict[str, list[EmbeddedEpisode]] = {}
     for episode in episodes:
         by_object.setdefault(episode.object, []).append(episode)
-    between: dict[str, list[np.ndarray]] = {}
+    spreads: dict[str, list[float]] = {}
     for group in by_object.values():
+        if len(group) < 2:
+            continue
         ends = [episode.take(slice(len(episode) - 1, None)) for episode in group]
         together = ends[0].extended(ends[1:])
+        others = ~np.eye(len(ends), dtype=bool)
         for name, d in part_distances(together, goal_at_every_frame(together)).items():
-            between.setdefault(name, []).append(d[~np.eye(len(ends), dtype=bool)])
-    pooled = {name: np.concatenate(d) for name, d in between.items()}
+            spreads.setdefault(name, []).append(float(np.quantile(d[others], _UNIT_QUANTILE)))
     return {
-        name: max(
-            float(np.quantile(d, _UNIT_QUANTILE)), SMALLEST_UNIT.get(name, SMALLEST_UNIT["front"])
-        )
-        for name, d in pooled.items()
-        if len(d)
+        name: max(float(np.mean(spread)), SMALLEST_UNIT.get(name, SMALLEST_UNIT["front"]))
+        for name, spread in spreads.items()
     }
 
 

@@ -1,16 +1,20 @@
 """Named parts of a cost: what each one measures, its distance to a goal, and how they are fused.
 
-A part's cost is min(d / unit, 3) / 3, with its distance d to the goal and, as the unit, the spread
-of d among successful ends of the same object. 0 is the goal, 1/3 the spread of successes, 1 far
-away. A fingertip part costs its no-contact value until contact is detected, with hysteresis
-(`ContactReader`): before contact only the cameras can lower the fused cost.
+A part's cost is d^2 / (d^2 + (1.5 unit)^2), with its distance d to the goal and, as the unit, the
+spread of d among successful ends of the same object: 0 is the goal, 0.3 the spread of successes, 1
+far away. The unit is a normalizer's, or the spread of the goals themselves if that is larger: some
+objects are held less alike than others. A fingertip part costs its no-contact value until contact
+is detected, with hysteresis (`ContactReader`): before contact only the other parts can lower the
+fused cost.
 
     front, wrist  pooled features of the camera of that name
     wrist_map     feature map of the wrist camera at stride 16: where objects are in the hand's frame
     object        touch embedding: which object is held
-    force         grip force, from the depth of the gel
     centre        where on the fingertips the object is held
     held          whether the fingertips touch
+    slip          how far the contact has moved on the fingertips since the grasp (`SlipMeter`)
+    wrench        force on the arm, where it is recorded: the object pressed on the table
+    force         grip force, from the depth of the gel: a line of its own, not in the fused cost
     words         touch against a sentence: the normalised distance, clipped to [0, 1]
     value         1 - the progress that a `Value` predicts; it does not depend on the goal
 """
@@ -27,9 +31,11 @@ from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
 
 Costs = dict[str, Float[np.ndarray, " n"]]
 
-TOUCH_PARTS = ("object", "force", "centre", "held")
-FUSED, VALUE, WORDS = "fused", "value", "words"
-VALUE_SHARE = 0.5  # of the value in a fused cost; the rest is the mean of the parts
+TOUCH_PARTS = ("object", "force", "centre", "held", "slip")
+FUSED, VALUE, WORDS, FORCE = "fused", "value", "words", "force"
+VALUE_SHARE = 0.3
+"""Share of the value in a fused cost; the rest is the root mean square of the parts. Chosen, like the
+form of a part's cost, on objects that `benchmark reward-quality` does not judge on."""
 SMALLEST_UNIT = {
     "front": 1e-3,
     "wrist": 1e-3,
@@ -37,11 +43,14 @@ SMALLEST_UNIT = {
     "object": 1e-3,
     "force": 0.05,  # log ratio
     "centre": 2e-4,  # m
+    "slip": 2e-4,  # m
+    "wrench": 1.0,  # N
     "held": 1 / 3,  # so that a missing fingertip costs 1
 }
 """Least unit of each part, about the noise of a camera: some demonstrations end almost alike. Other
 cameras have the one of `front`."""
-_SATURATION = 3.0  # units beyond which a part does not count further
+_HALF = 1.5  # units at which a part costs 0.5
+_SPREAD_QUANTILE = 0.9
 _FORCE_FLOOR = 0.5  # N, below which the depth of a gel reads noise
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
 _SOFTNESS = 8.0  # exponent of the soft minimum
@@ -56,7 +65,7 @@ def part_distances(
 
     Pictures: cosine distance, at stride 16 its mean over positions. Object: half the squared
     distance of embeddings. Force: |log ratio| of the mean over the fingertips. Centre: m. Held: 0
-    or 1. The last four are means over the fingertips.
+    or 1. Slip: m, whatever the goal. These are means over the fingertips. Wrench: N.
     """
     distances = {}
     for key, camera in goal.cameras.items():
@@ -69,6 +78,9 @@ def part_distances(
     if goal.touch is not None and goal.readings is not None and episode.readings is not None:
         distances["object"] = object_distances(episode.touches(), goal.touch)
         distances |= contact_distances(episode.readings, goal.readings)
+    if goal.wrench is not None and episode.wrench is not None:
+        force, wanted = (w[:, :3].astype(np.float64) for w in (episode.wrench, goal.wrench))
+        distances["wrench"] = np.linalg.norm(force[:, None] - wanted, axis=-1)
     return distances
 
 
@@ -100,7 +112,7 @@ def object_distances(
 def contact_distances(
     mine: ContactReadings, goal: ContactReadings
 ) -> dict[str, Float[np.ndarray, "n g"]]:
-    """Return the distances of force (log ratio), centre (m) and of being held (0 or 1)."""
+    """Return the distances of force (log ratio), centre (m), slip (m), and of being held (0 or 1)."""
     apart = mine.touching[:, :, None] != goal.touching[:, None]
     distances = {"held": apart.any(0).astype(np.float64)}
     if mine.force is not None and goal.force is not None:
@@ -111,6 +123,9 @@ def contact_distances(
     if mine.centre is not None and goal.centre is not None:
         away = np.linalg.norm(mine.centre[:, :, None] - goal.centre[:, None], axis=-1)
         distances["centre"] = np.where(apart, _NO_CONTACT, away).mean(0).astype(np.float64)
+    if mine.slip is not None:
+        slip = mine.slip.astype(np.float64).mean(0)
+        distances["slip"] = np.repeat(slip[:, None], goal.touching.shape[1], axis=1)
     return distances
 
 
@@ -126,18 +141,31 @@ def soft_minimum(distances: Float[np.ndarray, "n g"]) -> Float[np.ndarray, " n"]
 
 def part_costs(episode: EmbeddedEpisode, goal: EmbeddedGoal, units: Mapping[str, float]) -> Costs:
     """Return the cost of each part that has a unit, in [0, 1]; fingertip parts gated by contact."""
-    distances = part_distances(episode, goal)
-    costs = {
-        name: np.minimum(soft_minimum(d) / units[name], _SATURATION) / _SATURATION
-        for name, d in distances.items()
-        if name in units
-    }
+    own, costs = goal_spread(goal), {}
+    for name, d in part_distances(episode, goal).items():
+        if name in units:
+            half = (_HALF * max(units[name], own.get(name, 0.0))) ** 2
+            square = soft_minimum(d) ** 2
+            costs[name] = square / (square + half)
     if episode.readings is None or goal.readings is None:
         return costs
     touching = np.asarray(episode.readings.touching.any(axis=0))
     wanted = bool(goal.readings.touching.any())
     gated = {k: gate(c, touching, wanted) for k, c in costs.items() if k in TOUCH_PARTS}
     return costs | gated
+
+
+def goal_spread(goal: EmbeddedGoal) -> dict[str, float]:
+    """Return by part how far several goals are from each other, each measured to the others.
+
+    Parts with a single goal are left out, and slip, which does not depend on the goal.
+    """
+    spread = {}
+    for name, d in part_distances(goal.as_frames(), goal).items():
+        if (n := len(d)) > 1 and name != "slip":
+            others = d[~np.eye(n, dtype=bool)].reshape(n, n - 1)
+            spread[name] = float(np.quantile(soft_minimum(others), _SPREAD_QUANTILE))
+    return spread
 
 
 def gate(
@@ -150,16 +178,16 @@ def gate(
 def smooth_and_fuse(
     parts: Mapping[str, Float[np.ndarray, " n"]], fps: float, before: Mapping[str, float] | None
 ) -> Costs:
-    """Return the smoothed parts and "fused": their mean, or half the value and half that mean.
+    """Return the smoothed parts and "fused": their root mean square, and a share of the value.
 
     `before` has the costs of the previous frame, None at the beginning. Empty without parts.
     """
     last = before or {}
     smoothed = {name: smooth(cost, fps, last.get(name)) for name, cost in parts.items()}
-    equal = [cost for name, cost in smoothed.items() if name != VALUE]
+    equal = [cost for name, cost in smoothed.items() if name not in (VALUE, FORCE)]
     if not equal:
         return {}
-    fused = np.mean(equal, axis=0)
+    fused = np.sqrt(np.mean(np.square(equal), axis=0))
     if VALUE in smoothed:
         fused = VALUE_SHARE * smoothed[VALUE] + (1 - VALUE_SHARE) * fused
     return smoothed | {FUSED: fused}

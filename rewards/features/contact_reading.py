@@ -1,6 +1,6 @@
-"""Contact of each fingertip frame by frame: whether it touches, how hard, and where on the gel."""
+"""Contact of each fingertip frame by frame: whether it touches, how hard, where, and slip."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,6 +15,7 @@ from touchgoal.control.tactile.force import contact_centre, estimate_force
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.episodes.touches import touch_background
+from touchgoal.rewards.features.slip import SlipMeter
 
 _CELL = 8  # px, finest cells of the depth map: a third of the time of 2 (`DepthEstimator`)
 
@@ -27,14 +28,15 @@ class ContactReadings:
     # None where the sensor has no calibration file
     force: Float32[np.ndarray, "sides n"] | None = None  # normal force, N
     centre: Float32[np.ndarray, "sides n 2"] | None = None  # m from the image's middle, x and y
+    slip: Float32[np.ndarray, "sides n"] | None = None  # m, see `SlipMeter`
 
     def take(self, rows: slice | np.ndarray) -> "ContactReadings":
         """Return the readings of some frames."""
-        return ContactReadings(
-            self.touching[:, rows],
-            None if self.force is None else self.force[:, rows],
-            None if self.centre is None else self.centre[:, rows],
-        )
+        return self._map(lambda reading: reading[:, rows])
+
+    def of_sides(self, sides: np.ndarray) -> "ContactReadings":
+        """Return the readings of some fingertips, in this order."""
+        return self._map(lambda reading: reading[sides])
 
     @staticmethod
     def join(pieces: "Sequence[ContactReadings]") -> "ContactReadings":
@@ -46,14 +48,17 @@ class ContactReadings:
         """Return the readings of several fingertips as one."""
         return _concatenated(sides, axis=0)
 
+    def _map(self, change: Callable[[np.ndarray], np.ndarray]) -> "ContactReadings":
+        known = {
+            name: change(reading) for name, reading in vars(self).items() if reading is not None
+        }
+        return ContactReadings(**known)
+
 
 def _concatenated(readings: Sequence[ContactReadings], axis: int) -> ContactReadings:
-    force = [r.force for r in readings if r.force is not None]
-    centre = [r.centre for r in readings if r.centre is not None]
+    known = [name for name, reading in vars(readings[0]).items() if reading is not None]
     return ContactReadings(
-        np.concatenate([r.touching for r in readings], axis=axis),
-        np.concatenate(force, axis=axis) if force else None,
-        np.concatenate(centre, axis=axis) if centre else None,
+        **{name: np.concatenate([vars(r)[name] for r in readings], axis=axis) for name in known}
     )
 
 
@@ -64,9 +69,11 @@ class ContactReader:
     Printed dots are left in. The force is nominal: `estimate_force`.
     """
 
-    def __init__(self, sensor: SensorModel | None, untouched: UInt8[np.ndarray, "n h w 3"]) -> None:
-        """Take the sensor model, None for an unknown sensor, and frames without contact."""
-        self._sensor = sensor
+    def __init__(
+        self, sensor: SensorModel | None, untouched: UInt8[np.ndarray, "n h w 3"], fps: float
+    ) -> None:
+        """Take the sensor model, None for an unknown sensor, frames without contact, and the rate."""
+        self._sensor, self._slip = sensor, SlipMeter(fps)
         self._depth: DepthEstimator | None = None
         self._pitch, self._size = 0.0, untouched.shape[2:0:-1]
         if sensor is not None:
@@ -81,16 +88,20 @@ class ContactReader:
 
     def read(self, frames: UInt8[np.ndarray, "n h w 3"]) -> ContactReadings:
         """Return the readings of the next frames, as one side."""
-        touching, force, centre = [], [], []
+        touching, force, centre, slip = [], [], [], []
         for frame in frames:
             now, f, c = self._read_frame(self._resized(frame))
             touching.append(now)
             force.append(f)
             centre.append(c)
+            slip.append(self._slip.update(now, c))
         if self._sensor is None:
             return ContactReadings(np.array([touching]))
         return ContactReadings(
-            np.array([touching]), np.array([force], np.float32), np.array([centre], np.float32)
+            np.array([touching]),
+            np.array([force], np.float32),
+            np.array([centre], np.float32),
+            np.array([slip], np.float32),
         )
 
     def _read_frame(self, frame: Picture) -> tuple[bool, float, tuple[float, float]]:

@@ -52,6 +52,7 @@ class EmbeddedEpisode:
     # features of the parts of a cost, by key of the camera; empty and None if not requested
     cameras: Mapping[str, CameraFeatures] = field(default_factory=dict)
     readings: ContactReadings | None = None  # contact of the fingertips `sides`
+    wrench: Float32[np.ndarray, "n 6"] | None = None  # external force N, torque Nm; base frame
 
     def __len__(self) -> int:
         return self.touches().shape[1] if self.image is None else len(self.image)
@@ -81,18 +82,21 @@ class EmbeddedEpisode:
             touch=None if self.touch is None else self.touch[:, rows],
             cameras={key: camera.take(rows) for key, camera in self.cameras.items()},
             readings=None if self.readings is None else self.readings.take(rows),
+            wrench=None if self.wrench is None else self.wrench[rows],
         )
 
     def extended(self, later: "Sequence[EmbeddedEpisode]") -> "EmbeddedEpisode":
         """Return this trajectory with consecutive later pieces of itself behind it."""
         pieces = (self, *later)
         readings = [p.readings for p in pieces if p.readings is not None]
+        wrenches = [p.wrench for p in pieces if p.wrench is not None]
         return replace(
             self,
             image=None if self.image is None else np.concatenate([p.pictures() for p in pieces]),
             touch=None if self.touch is None else np.concatenate([p.touches() for p in pieces], 1),
             cameras={k: CameraFeatures.join([p.cameras[k] for p in pieces]) for k in self.cameras},
             readings=ContactReadings.join(readings) if readings else None,
+            wrench=np.concatenate(wrenches) if wrenches else None,
         )
 
 
@@ -111,6 +115,21 @@ class EmbeddedGoal:
     text_baseline: Float32[np.ndarray, "b k"] | None = None  # of the baseline sentence, if any
     cameras: Mapping[str, CameraFeatures] = field(default_factory=dict)
     readings: ContactReadings | None = None
+    wrench: Float32[np.ndarray, "g 6"] | None = None
+
+    def as_frames(self) -> EmbeddedEpisode:
+        """Return the goals as the frames of an episode."""
+        return EmbeddedEpisode(
+            source="goals",
+            fps=1.0,
+            contact=Contact(None, "not looked for"),
+            made_with=EmbeddingSource("", ""),
+            image=self.image,
+            touch=self.touch,
+            cameras=self.cameras,
+            readings=self.readings,
+            wrench=self.wrench,
+        )
 
 
 def goal_at_every_frame(frames: EmbeddedEpisode) -> EmbeddedGoal:
@@ -122,4 +141,5 @@ def goal_at_every_frame(frames: EmbeddedEpisode) -> EmbeddedGoal:
         touch=frames.touch,
         cameras=frames.cameras,
         readings=frames.readings,
+        wrench=frames.wrench,
     )

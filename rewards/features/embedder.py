@@ -234,7 +234,7 @@ class EpisodeEmbedder:
                 for side in own.sides
             }
             end = self.stream(frames, own.fps, str(spec)).embed(frames).take(_one(START_FRAMES))
-        return {"touch": end.touch, "readings": end.readings}
+        return {"touch": end.touch, "readings": end.readings, "wrench": end.wrench}
 
     def _successful_ends(self, spec: Bank | GoalFile, own: EmbeddedEpisode) -> SuccessfulEnds:
         """Return the ends of a bank, embedded once; UserError if they were embedded otherwise."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.features import CAMERAS
+from touchgoal.control.features import CAMERAS, WRENCH
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Contact
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from touchgoal.rewards.features.embedder import EpisodeEmbedder
 
 Frames = Mapping[str, np.ndarray]
-"""Frames by key, (n, ...) each; keys that are neither camera nor fingertip are ignored."""
+"""Frames by key, (n, ...) each; keys other than cameras, fingertips and wrench are ignored."""
 
 
 class FeatureStream:
@@ -41,7 +41,7 @@ class FeatureStream:
             str, np.ndarray
         ] = {}  # newest frames of each side, for encoders of several
         self._readers = {
-            side: ContactReader(sensor, frames)
+            side: ContactReader(sensor, frames, fps)
             for side, frames in untouched.items()
             if embedder.with_parts
         }
@@ -66,6 +66,7 @@ class FeatureStream:
             words=embedder.knows_words,
             cameras=cameras if embedder.with_parts else {},
             readings=self._read(frames) if self._readers else None,
+            wrench=frames.get(WRENCH) if embedder.with_parts else None,
         )
 
     def _embed_touch(

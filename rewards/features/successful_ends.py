@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -66,7 +66,7 @@ class SuccessfulEnds:
     def save(self, path: Path) -> None:
         """Write a compressed npz file, atomically."""
         frames = self.frames
-        arrays = {"image": frames.image, "touch": frames.touch}
+        arrays = {"image": frames.image, "touch": frames.touch, "wrench": frames.wrench}
         for key, camera in frames.cameras.items():
             arrays |= {f"pooled/{key}": camera.pooled, f"map/{key}": camera.map}
         if frames.readings is not None:
@@ -103,7 +103,8 @@ def _frames(
     keys = [key.removeprefix("pooled/") for key in arrays if key.startswith("pooled/")]
     readings = None
     if "touching" in arrays:
-        readings = ContactReadings(arrays["touching"], arrays.get("force"), arrays.get("centre"))
+        names = [field.name for field in fields(ContactReadings) if field.name in arrays]
+        readings = ContactReadings(**{name: arrays[name] for name in names})
     return EmbeddedEpisode(
         source=name,
         fps=1.0,
@@ -115,4 +116,5 @@ def _frames(
         words=bool(about["words"]),
         cameras={k: CameraFeatures(arrays[f"pooled/{k}"], arrays.get(f"map/{k}")) for k in keys},
         readings=readings,
+        wrench=arrays.get("wrench"),
     )

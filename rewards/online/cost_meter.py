@@ -14,6 +14,7 @@ from touchgoal.control.features import (
     FRONT,
     IMAGE_PREFIX,
     TACTILE,
+    WRENCH,
     Observation,
 )
 from touchgoal.control.sensors.latest_value import LatestValue
@@ -86,8 +87,8 @@ class CostMeter:
 
 
 def _stacked(ticks: Sequence[Observation]) -> dict[str, np.ndarray]:
-    """Return the images of some ticks by key."""
-    keys = [key for key in (*CAMERAS, *TACTILE) if key in ticks[0]]
+    """Return what the cost reads of some ticks, by key."""
+    keys = [key for key in (*CAMERAS, *TACTILE, WRENCH) if key in ticks[0]]
     return {key: np.stack([tick[key] for tick in ticks]) for key in keys}
 
 

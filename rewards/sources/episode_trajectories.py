@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT
+from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT, WRENCH
 from touchgoal.episodes.faults import find_faults
 from touchgoal.episodes.schema import Episode, is_camera, is_image
 from touchgoal.episodes.store import EpisodeSet
@@ -53,7 +53,9 @@ def open_episodes(root: Path, camera: str, index: Sequence[int], with_touch: boo
     touch = tuple(key for key in TACTILE if with_touch and key in episodes.features)
     camera = _find_camera(episodes, camera, bool(touch))
     cameras = tuple(key for key in dict.fromkeys((*CAMERAS, camera)) if key in episodes.features)
-    keys = tuple(key for key in (*cameras, *touch, TRUTH_CONTACT) if key in episodes.features)
+    keys = tuple(
+        key for key in (*cameras, *touch, TRUTH_CONTACT, WRENCH) if key in episodes.features
+    )
     found = _trajectories(episodes, chosen, keys)
     sensors = {str(t.meta["sensor"]) for t in found if t.meta.get("sensor")}
     if len(sensors) > 1:

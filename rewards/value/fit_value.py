@@ -13,9 +13,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
 LEAST_EPISODES = 4
-_STEPS, _BATCH = 400, 128
-_LEARNING_RATE, _WEIGHT_DECAY = 3e-3, 1.0  # unseen objects: mean error .064, with 0.1 .065
-_STRIDE = 2  # every second frame is trained on: neighbours look alike
+_STEPS, _BATCH = 1000, 128  # "off" of objects not fitted: AUC .90, after 400 steps .78
+_LEARNING_RATE, _WEIGHT_DECAY = 3e-3, 1.0  # the same with 5: .81, with 20: .71
 
 
 def fit_value(episodes: Sequence[EmbeddedEpisode], task: str, seed: int = 0) -> Value:
@@ -25,7 +24,7 @@ def fit_value(episodes: Sequence[EmbeddedEpisode], task: str, seed: int = 0) -> 
     """
     keys = _check(episodes)
     maps = torch.from_numpy(np.concatenate([_maps(e, keys) for e in episodes]))
-    target = torch.cat([torch.linspace(0, 1, len(e))[::_STRIDE] for e in episodes])
+    target = torch.cat([torch.linspace(0, 1, len(e)) for e in episodes])
     first = episodes[0].cameras[keys[0]].map
     assert first is not None  # checked
     channels, rows, columns = first.shape[1:]
@@ -73,6 +72,6 @@ def _check(episodes: Sequence[EmbeddedEpisode]) -> tuple[str, ...]:
 
 
 def _maps(episode: EmbeddedEpisode, keys: Sequence[str]) -> Float16[np.ndarray, "n cameras c yx"]:
-    maps = [m[::_STRIDE] for key in keys if (m := episode.cameras[key].map) is not None]
+    maps = [m for key in keys if (m := episode.cameras[key].map) is not None]
     together = np.stack(maps, axis=1)
     return together.reshape(*together.shape[:3], -1)

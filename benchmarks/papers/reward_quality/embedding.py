@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from touchgoal.benchmarks.papers.reward_quality.recording import Recorded
-from touchgoal.control.features import CAMERAS, TACTILE, TRUTH_CONTACT
+from touchgoal.control.features import CAMERAS, TACTILE, TRUTH_CONTACT, WRENCH
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.store import EpisodeSet
@@ -62,7 +62,7 @@ def _embed(files: EmbeddedFiles, recorded: Recorded) -> None:
     torch.set_num_threads(1)
     episodes = EpisodeSet(recorded.root)
     i, embedder = recorded.index, load_embedder(files.encoder)
-    keys = [key for key in (*CAMERAS, *TACTILE, TRUTH_CONTACT) if key in episodes.features]
+    keys = [key for key in (*CAMERAS, *TACTILE, TRUTH_CONTACT, WRENCH) if key in episodes.features]
     frames = range((episodes.lengths[i] - 1) % files.every, episodes.lengths[i], files.every)
     embedded = embedder.embed_episode(
         episodes.read(i, keys, frames),
