@@ -15,13 +15,16 @@ from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingS
 from touchgoal.rewards.distance.parts import (
     contact_distances,
     gate,
+    goal_spread,
     object_distances,
+    part_costs,
     part_distances,
     smooth,
     soft_minimum,
 )
 from touchgoal.rewards.features.contact_reading import ContactReader, ContactReadings
 from touchgoal.rewards.features.embedded import CameraFeatures, EmbeddedEpisode, goal_at_every_frame
+from touchgoal.rewards.features.slip import SlipMeter
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.online.failure_watch import FailureWatch
 from touchgoal.rewards.value.fit_value import fit_value
@@ -31,8 +34,13 @@ from touchgoal.runtime.errors import UserError
 N, GRASP = 40, 15
 
 
-def embedded(seed: int, success: bool = True, force: float = 10.0) -> EmbeddedEpisode:
-    """Two cameras that see the progress in their first channel, and a grasp from `GRASP` on."""
+def embedded(
+    seed: int, success: bool = True, force: float = 10.0, slip: float = 0.0, pressed: float = 0.0
+) -> EmbeddedEpisode:
+    """Two cameras that see the progress in their first channel, and a grasp from `GRASP` on.
+
+    It ends `slip` m from where it was grasped, with `pressed` N on the arm.
+    """
     rng = np.random.default_rng(seed)
     progress = np.linspace(0, 1 if success else 0.4, N)
 
@@ -50,7 +58,10 @@ def embedded(seed: int, success: bool = True, force: float = 10.0) -> EmbeddedEp
         held,
         (held * (force + rng.normal(0, 0.5, (2, N)))).astype(np.float32),
         (held[..., None] * rng.normal(1e-3, 1e-4, (2, N, 2))).astype(np.float32),
+        (held * (slip * progress + rng.uniform(0, 1e-4, (2, N)))).astype(np.float32),
     )
+    wrench = rng.normal(0, 0.3, (N, 6))
+    wrench[:, 2] += pressed * progress
     cameras = {FRONT: camera(2), WRIST: camera(2)}
     return EmbeddedEpisode(
         source=f"episode {seed}",
@@ -65,6 +76,7 @@ def embedded(seed: int, success: bool = True, force: float = 10.0) -> EmbeddedEp
         words=False,
         cameras=cameras,
         readings=readings,
+        wrench=wrench.astype(np.float32),
     )
 
 
@@ -87,13 +99,22 @@ def test_a_failure_of_each_part_raises_that_part(
     successes: list[EmbeddedEpisode], normalizer: DistanceNormalizer, value: Value
 ) -> None:
     goal = goal_at_every_frame(successes[0].take(slice(-1, None)))
-    good, hard, early = (
-        compute_curves(e, goal, normalizer, value).parts
-        for e in (embedded(9), embedded(9, force=40.0), embedded(9, success=False))
+    ends = (
+        embedded(9),
+        embedded(9, force=40.0),
+        embedded(9, success=False),
+        embedded(9, slip=5e-3),
+        embedded(9, pressed=30.0),
+    )
+    good, hard, early, slid, pressed = (
+        compute_curves(end, goal, normalizer, value).parts for end in ends
     )
     assert {name: cost[-1] < 0.5 for name, cost in good.items()} == dict.fromkeys(good, True)
     assert hard["force"][-1] > good["force"][-1] + 0.4
-    assert hard["front"][-1] == pytest.approx(good["front"][-1])
+    assert hard["fused"] == pytest.approx(good["fused"]), "force is a line of its own"
+    for failure, name in ((slid, "slip"), (pressed, "wrench")):
+        assert failure[name][-1] > good[name][-1] + 0.4
+        assert failure["fused"][-1] > good["fused"][-1] + 0.05
     for name in ("front", "wrist", "wrist_map", "value", "fused"):
         assert early[name][-1] > good[name][-1] + 0.2, name
     for cost in good.values():
@@ -144,6 +165,32 @@ def test_distances_by_hand() -> None:
     pieces = [smooth(cost[:4], 20)]
     pieces.append(smooth(cost[4:], 20, float(pieces[0][-1])))
     assert np.concatenate(pieces) == pytest.approx(smooth(cost, 20))
+
+
+def test_a_grasp_slips_from_where_it_settled() -> None:
+    """At 10 frames a second it settles for four; two frames without contact do not end it."""
+    meter = SlipMeter(10)
+    settling = [meter.update(True, (x * 1e-3, 0.0)) for x in (5, 3, 1, 0)]
+    assert settling == [0, 0, 0, 0]
+    assert meter.update(True, (0.0, 2e-3)) == pytest.approx(2e-3)
+    assert [meter.update(False, (0.0, 0.0)) for _ in range(2)] == pytest.approx([2e-3, 2e-3])
+    assert meter.update(True, (3e-3, 0.0)) == pytest.approx(3e-3)
+    assert [meter.update(False, (0.0, 0.0)) for _ in range(5)][-1] == 0
+    assert meter.update(True, (9e-3, 0.0)) == 0, "a new grasp"
+
+
+def test_goals_that_differ_widen_the_unit(successes: list[EmbeddedEpisode]) -> None:
+    """An object held elsewhere each time is not blamed for it; one goal alone says nothing."""
+    one = goal_at_every_frame(successes[0].take(slice(-1, None)))
+    assert goal_spread(one) == {}
+    ends = successes[0].take(slice(-3, None))
+    assert ends.readings is not None and ends.readings.centre is not None
+    centre = ends.readings.centre + np.array([0, 6e-3, 12e-3], np.float32)[:, None]
+    apart = goal_at_every_frame(replace(ends, readings=replace(ends.readings, centre=centre)))
+    assert goal_spread(apart)["centre"] == pytest.approx(6e-3 * 2**0.5, rel=0.1)
+    units = {"centre": 2e-4}
+    costs = [part_costs(embedded(9), goal, units)["centre"][-1] for goal in (one, apart)]
+    assert costs[1] < 0.1 < costs[0]
 
 
 def test_a_value_is_refused_elsewhere(successes: list[EmbeddedEpisode], value: Value) -> None:

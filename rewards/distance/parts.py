@@ -54,7 +54,7 @@ _SPREAD_QUANTILE = 0.9
 _FORCE_FLOOR = 0.5  # N, below which the depth of a gel reads noise
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
 _SOFTNESS = 8.0  # exponent of the soft minimum
-_CHUNK = 256  # frames of maps in float32 at once
+_CHUNK = 256  # frames of maps in float64 at once
 SMOOTHING = 0.1  # time constant of the causal smoothing, s
 
 
@@ -97,7 +97,7 @@ def map_distances(
     """Return 1 - cos at each position of two maps, mean over the positions."""
     theirs, positions = _unit_map(goals), goals.shape[2] * goals.shape[3]
     chunks = [_unit_map(mine[i : i + _CHUNK]) @ theirs.T for i in range(0, len(mine), _CHUNK)]
-    return 1 - np.concatenate(chunks).astype(np.float64) / positions
+    return 1 - np.concatenate(chunks) / positions
 
 
 def object_distances(
@@ -202,7 +202,7 @@ def smooth(
     return lfilter([1 - keep], [1, -keep], cost, zi=[keep * start])[0]
 
 
-def _unit_map(maps: Float16[np.ndarray, "n c y x"]) -> Float32[np.ndarray, "n cyx"]:
-    whole = maps.astype(np.float32)
+def _unit_map(maps: Float16[np.ndarray, "n c y x"]) -> Float[np.ndarray, "n cyx"]:
+    whole = maps.astype(np.float64)  # float32 would make batch and stream differ by 1e-6
     whole /= np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-6)
     return whole.reshape(len(whole), -1)
