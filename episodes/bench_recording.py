@@ -25,8 +25,8 @@ from touchgoal.episodes.format.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.cloths import CLOTHS, press_cloth
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.grasp_rig import attempt_grasp
@@ -41,7 +41,7 @@ Recorded = tuple[dict[str, np.ndarray], str, dict[str, Any]]  # frames, task, me
 
 
 def record_bench(
-    what: Recording, root: Path, config: RigConfig, count: int, workers: int
+    what: Recording, root: Path, config: RigConfig, count: int, workers: Workers
 ) -> EpisodeSet:
     """Record the first `count` episodes of a rig; those that the folder holds are not simulated again.
 
@@ -58,8 +58,7 @@ def record_bench(
             )
         if len(writer) < count:
             missing = range(len(writer), count)
-            with one_core_workers(workers) as pool:
-                made = pool.map(partial(_encoded, what, config, rig), missing)
+            with parallel_map(partial(_encoded, what, config, rig), missing, workers) as made:
                 for episode in track(made, root.name, "recording", total=len(missing)):
                     writer.append(episode)
     return EpisodeSet(root)

@@ -20,8 +20,8 @@ from touchgoal.episodes.outcomes.verify import outcome_reached
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
 from touchgoal.runtime.progress import progress_bar, track
-from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import BeadMazeConfig, Outcome, TaskConfig
 from touchgoal.sim_envs.scene.filming import SceneRecorder
@@ -198,7 +198,7 @@ def collect(
     root: Path,
     config: TaskConfig,
     specs: Sequence[EpisodeSpec],
-    workers: int,
+    workers: Workers,
     roles: Roles = expert_alone,
     max_failures: int | None = None,
 ) -> list[dict[str, MetaValue]]:
@@ -221,10 +221,10 @@ def collect(
     with closing(EpisodeWriter(root, fps=config.control_hz)) as writer:
         check_fits(writer, config)
         with (
-            one_core_workers(workers) as pool,
+            parallel_map(partial(_record, config, roles), specs, workers) as recorded,
             progress_bar("recording", len(specs), "episode") as bar,
         ):
-            for episode in pool.map(partial(_record, config, roles), specs):
+            for episode in recorded:
                 writer.append(episode)
                 metas.append(episode.description.meta)
                 if reason := _failure(episode.description):

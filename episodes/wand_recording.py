@@ -22,8 +22,8 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.episodes.wand_episode import FPS, SET, Visit, wand_episode
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.touch_wand import Touch, TouchWand, TouchWandConfig
 from touchgoal.sim_envs.wand.objects import wand_objects
 
@@ -31,7 +31,7 @@ TOUCHES_A_VISIT = 9
 _TRIES = 2000  # random approaches before an object counts as out of reach
 
 
-def record_touches(root: Path, sensor: str, seed: int, count: int, workers: int) -> EpisodeSet:
+def record_touches(root: Path, sensor: str, seed: int, count: int, workers: Workers) -> EpisodeSet:
     """Record the first `count` touches; those that the folder holds are not simulated again.
 
     UserError: the folder holds another set, or cannot be written to.
@@ -48,8 +48,7 @@ def record_touches(root: Path, sensor: str, seed: int, count: int, workers: int)
             )
         if have < count:
             visits = range(have // TOUCHES_A_VISIT, -(-count // TOUCHES_A_VISIT))
-            with one_core_workers(workers) as pool:
-                made = pool.map(partial(_visit, sensor, seed), visits)
+            with parallel_map(partial(_visit, sensor, seed), visits, workers) as made:
                 first = have - visits.start * TOUCHES_A_VISIT
                 new = islice(chain.from_iterable(made), first, first + count - have)
                 for episode in track(new, "touches", "touch", count - have):

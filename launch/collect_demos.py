@@ -45,6 +45,8 @@ class Config:
     """Random seed of the first episode; each further one adds one."""
     workers: Count = os.cpu_count() or 1
     """Number of simulating processes."""
+    ray: str | None = None
+    """Address of a Ray cluster whose cores work in place of --workers; auto: one started on this machine."""
     env: PickPlaceConfig | BeadMazeConfig = ENVS["pick-place"]
     """Options of the task; its objects or wires are taken in turn."""
 
@@ -86,7 +88,7 @@ def main(config: Config) -> None:
     kept = f"finished episodes are in {root}; the same command with --out {out} continues"
     try:
         with on_interruption(lambda: kept):
-            metas = collect(root, config.env, missing, config.workers, roles, most)
+            metas = collect(root, config.env, missing, config.ray or config.workers, roles, most)
     except NoSuccessError as error:
         print(f"{error}; look at one: touchgoal run-policy --task {config.task}", file=sys.stderr)
         sys.exit(NO_SUCCESS)

@@ -40,6 +40,8 @@ class Config:
     """Random seed."""
     workers: Count = os.cpu_count() or 1
     """Number of simulating processes."""
+    ray: str | None = None
+    """Address of a Ray cluster whose cores work in place of --workers; auto: one started on this machine."""
     wand: Path | None = None
     """File that names the devices of a real wand, which then records in place of the simulated one."""
     object: str | None = None
@@ -74,6 +76,7 @@ def _simulate(config: Any) -> None:
         raise UserError(
             "--object, --description and --new-gel are for a real wand: give --wand FILE"
         )
+    workers = config.ray or config.workers
     count = config.episodes or _DEFAULT[config.body][0]
     sensor = config.sensor or _DEFAULT[config.body][1]
     find_sensor(sensor)  # a wrong one is refused before anything is written
@@ -84,10 +87,10 @@ def _simulate(config: Any) -> None:
         lambda: f"finished episodes are in {root}; the same command with --out {out} continues"
     ):
         if config.body == "wand":
-            episodes = record_touches(root, sensor, config.seed, count, config.workers)
+            episodes = record_touches(root, sensor, config.seed, count, workers)
         else:
             rig = RigConfig(sensor=sensor, seed=config.seed)
-            episodes = record_bench("catalogue slides", root, rig, count, config.workers)
+            episodes = record_bench("catalogue slides", root, rig, count, workers)
     if recorded:
         print("nothing left to record:", end=" ")
     print(f"{len(episodes)} episodes, {sum(episodes.lengths)} images in {root}")

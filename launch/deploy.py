@@ -32,8 +32,9 @@ class Config:
     cell: Annotated[Path, tyro.conf.Positional]
     """Cell file: your own (.toml), the cell.json of a twin, or a shipped example by name, such as sim."""
     policy: str = ""
-    """Policy in place of the cell file's: expert, follower, shipped, a folder that train-policy made, or
-    a class of your own as module:Class or file.py:Class, whose code then runs."""
+    """Policy in place of the cell file's: expert, follower, shipped, a folder that train-policy made, a
+    class of your own as module:Class or file.py:Class, whose code then runs, or an openpi server as
+    ws://host:port."""
     execute: bool = False
     """Move the arm. Without it this is a dry run."""
     yes: bool = False

@@ -18,8 +18,8 @@ class Config:
     """Task to run it in."""
     policy: str = "shipped"
     """Policy: shipped; a folder that train-policy made; expert, which sees the simulator's state;
-    follower (bead-maze), classical control from the force on the hand; or a class of your own, as
-    module:Class or file.py:Class (docs/own_policy.md)."""
+    follower (bead-maze), classical control from the force on the hand; a class of your own, as
+    module:Class or file.py:Class, or an openpi server, as ws://host:port (docs/own_policy.md)."""
     out: Path | None = None
     """Folder of the run."""
     episodes: Count = 20
@@ -28,6 +28,8 @@ class Config:
     """Random seed of the first episode; each further one adds one."""
     workers: Count = os.cpu_count() or 1
     """Processes that simulate."""
+    ray: str | None = None
+    """Address of a Ray cluster whose cores work in place of --workers; auto: one started on this machine."""
     video: bool = True
     """Film the worst, the median and the best episode."""
     env: PickPlaceConfig | BeadMazeConfig = ENVS["pick-place"]
@@ -44,7 +46,8 @@ def main(config: Config) -> None:
     policy, env = prepare_policy(config.policy, config.env)
     specs = trial_specs(env, config.episodes, config.seed)
     out = open_run(config.out, "run-policy", replace(config, env=env))
-    trials = record_trials(out, run_trials(env, policy, specs, config.workers), len(specs))
+    trials = run_trials(env, policy, specs, config.ray or config.workers)
+    trials = record_trials(out, trials, len(specs))
     if config.video:
         film_trials(out, env, specs, trials, policy, config.workers)
     cell = "sim" if config.task == "pick-place" else "sim_maze"

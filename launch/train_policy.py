@@ -121,6 +121,8 @@ class Config(TrainingOptions):
     """Options of the task in which snapshots are tried; name it with --task."""
     workers: Count = os.cpu_count() or 1
     """Processes that simulate."""
+    ray: str | None = None
+    """Address of a Ray cluster whose cores work in place of --workers; auto: one started on this machine."""
 
 
 def main(config: Config) -> None:
@@ -169,8 +171,9 @@ def main(config: Config) -> None:
         print(f"no simulator knows {task!r}: snapshots are not tried, the last one is taken")
     training_data.report_pauses(pauses[0], sets[0].fps, config.trim_pauses)
     skipped = pauses if config.trim_pauses else [None, None]
+    workers = config.ray or config.workers
     recordings = (
-        load_recordings(s, r, policy, touch, config.workers, skip=skip)
+        load_recordings(s, r, policy, touch, workers, skip=skip)
         for (s, r), skip in zip(chosen, skipped, strict=True)
     )
     windows, validation = (SequenceDataset(own, policy) for own in recordings)
@@ -181,7 +184,7 @@ def main(config: Config) -> None:
         return
     copy_parts(out / POLICY, parts)
     if env is not None and trials:
-        scores = select(out, parts, lambda d: score(d, env, trials, config.workers))
+        scores = select(out, parts, lambda d: score(d, env, trials, workers))
         write_json(out / "metrics.json", {"snapshots": scores})
     print(f"policy: {out / POLICY}")
     if simulated:

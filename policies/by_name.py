@@ -1,6 +1,6 @@
-"""Policies by name: `expert`, `follower`, `shipped`, a folder, or a user's class.
+"""Policies by name: `expert`, `follower`, `shipped`, a folder, a user's class or a server.
 
-For a user's own class see `control/deployment/user_policy.py`.
+For the last two see `control/deployment/user_policy.py`.
 """
 
 from collections.abc import Callable
@@ -12,6 +12,7 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.deployment.actors import DeployedPolicy
 from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.deployment.user_policy import Policy, UserPolicy, find_user_policy
+from touchgoal.control.policy_server.policy import PolicyServer
 from touchgoal.episodes.recording import Actor
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy, suggestion
@@ -91,7 +92,7 @@ def choose_policy(policy: AnyPolicy, task: TaskConfig) -> PolicyMaker:
             ) from error
         raise UserError(
             f"there is no policy {name!r}: {suggestion(name, tuple(POLICIES))}, or a class of your "
-            "own as module:Class or file.py:Class"
+            "own as module:Class or file.py:Class, or a server as ws://host:port"
         ) from error
 
 
@@ -100,7 +101,7 @@ def env_config_for(maker: PolicyMaker, task: TaskConfig) -> TaskConfig:
 
     UserError: the policy cannot act in the task.
     """
-    if isinstance(maker, SavedPolicy | UserPolicy):
+    if isinstance(maker, SavedPolicy | UserPolicy | PolicyServer):
         return maker.env_config(task)
     return replace(task, tactile=False, cameras=())
 

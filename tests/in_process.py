@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from touchgoal.runtime import worker_pool
+from touchgoal.runtime.parallel import worker_pool
 
 
 class _InProcess(Executor):

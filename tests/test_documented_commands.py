@@ -34,7 +34,7 @@ from touchgoal.episodes.media import write_video
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import COMMANDS, read_options
 from touchgoal.launch.deploy import NOT_DONE
-from touchgoal.runtime.worker_pool import one_core_workers
+from touchgoal.runtime.parallel.worker_pool import one_core_workers
 
 Shell = Callable[[list[str]], int]
 ALL = list(commands())

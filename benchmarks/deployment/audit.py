@@ -6,6 +6,7 @@ policy on the next wire or in the next scene; where it is shorter, its last tick
 
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,8 @@ from touchgoal.episodes.recording import Actor, EpisodeSpec
 from touchgoal.policies.by_name import PolicyMaker, prepare_policy
 from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trial, trial_specs
 from touchgoal.runtime.option_types import checked_dataclass
+from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.config import TaskConfig
 
 
@@ -60,8 +61,7 @@ def run(config: Config) -> dict[str, Any]:
         maker, env = prepare_policy(config.policy, config.environment(task))
         specs = trial_specs(env, config.episodes + 1, config.seed)
         audit = partial(_audit, env, maker)
-        with one_core_workers(min(config.workers, config.episodes)) as pool:
-            found = pool.map(audit, specs[:-1], specs[1:])
+        with parallel_map(audit, list(pairwise(specs)), config.workers) as found:
             trials = list(track(found, f"{task}: audit", "episode", total=config.episodes))
         for name in trials[0]:
             of_name = tuple(trial[name] for trial in trials)
@@ -78,9 +78,10 @@ def _inputs(env: TaskConfig) -> dict[str, tuple[str, ...]]:
 
 
 def _audit(
-    env: TaskConfig, maker: PolicyMaker, spec: EpisodeSpec, other: EpisodeSpec
+    env: TaskConfig, maker: PolicyMaker, pair: tuple[EpisodeSpec, EpisodeSpec]
 ) -> dict[str, Trial]:
-    """Run `other` as it is, then `spec` with one input after the other taken from `other`."""
+    """Run the second episode as it is, then the first with one input after the other from the second."""
+    spec, other = pair
     watched: list[_Watched] = []
 
     def watch(made_for: Any) -> Actor:

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -29,8 +30,8 @@ from touchgoal.policies.evaluation.evaluate import run_trial, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Positive, Seed, checked_dataclass
+from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskName
 
 Arm = Literal["environment", "in-process", "lock-step", "real-time"]
@@ -70,15 +71,7 @@ def run(config: Config) -> dict[str, Any]:
         for name in config.policies:
             policy = scripted(task) if name == "scripted" else name
             for arm in config.arms:
-                open_pool = one_core_workers if arm == "environment" else ThreadPoolExecutor
-                # Deployments are processes, and real-time ones run alone.
-                with open_pool(1 if arm == "real-time" else config.workers) as pool:
-                    begun = [
-                        pool.submit(_deploy, scene, policy, arm, i, config.seconds)
-                        for i, scene in enumerate(scenes)
-                    ]
-                    bar = f"{task}, {policy}, {arm}"
-                    rows = [job.result() for job in track(begun, bar, "deployment")]
+                rows = _deploy_all(scenes, policy, arm, config)
                 lines += (own := _lines(rows))
                 print("\n".join(own), file=sys.stderr)
                 done += rows
@@ -93,7 +86,19 @@ def _scenes(task: TaskName, config: Config) -> Iterator[Scene]:
         yield Scene(task, spec.seed, str(next(iter(spec.options.values()))))
 
 
-def _deploy(scene: Scene, policy: str, arm: str, number: int, seconds: float) -> Deployment:
+def _deploy_all(scenes: list[Scene], policy: str, arm: Arm, config: Config) -> list[Deployment]:
+    """Deploy in each scene. On an arm deployments are processes, and real-time ones run alone."""
+    bar, jobs = f"{scenes[0].task}, {policy}, {arm}", list(enumerate(scenes))
+    one = partial(_deploy, policy, arm, config.seconds)
+    if arm == "environment":
+        with parallel_map(one, jobs, config.workers) as rows:
+            return list(track(rows, bar, "deployment", total=len(jobs)))
+    with ThreadPoolExecutor(1 if arm == "real-time" else config.workers) as pool:
+        return list(track(pool.map(one, jobs), bar, "deployment", total=len(jobs)))
+
+
+def _deploy(policy: str, arm: str, seconds: float, job: tuple[int, Scene]) -> Deployment:
+    number, scene = job
     if arm == "environment":
         return _in_environment(scene, policy)
     with tempfile.TemporaryDirectory() as name:

@@ -125,7 +125,7 @@ class TaskSection:
     recordings alone: no object, no goal, and the episode ends by key or time."""
     policy: str = ""
     """Policy: expert (pick-place, from known positions), follower (bead-maze), shipped, a folder that
-    train-policy made, or a class of your own (file.py:Class), whose code then runs."""
+    train-policy made, a class of your own (file.py:Class), whose code then runs, or ws://host:port."""
     instruction: str = ""
     """Instruction in words, for the record; default: the name."""
     seconds: Annotated[float, Field(gt=0, le=3600)] = 30.0

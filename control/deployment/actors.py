@@ -58,11 +58,11 @@ class DeployedPolicy:
 
 
 def load_user_policy(cell: CellConfig, options: PolicyNeeds) -> DeployedPolicy | None:
-    """Return the cell's policy if it is a user's class; UserError if it does not fit the cell.
+    """Return the cell's policy if it is a user's class or server; UserError if it does not fit.
 
     It may change the `options` of its environment.
     """
-    if (found := find_user_policy(cell.task.policy)) is None:
+    if (found := find_user_policy(cell.task.policy, cell.task.instruction)) is None:
         return None
     return DeployedPolicy.for_cell(cell, found(), found.env_config(options))
 

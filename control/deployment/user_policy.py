@@ -1,5 +1,5 @@
 """A user's own policy: a class with two methods, `module:Class` or `file.py:Class`
-(docs/own_policy.md).
+(docs/own_policy.md), or a server (`policy_server/`).
 
 The class is made without arguments, once per episode, in the process that simulates it. An optional
 method `env_config(config)` returns the options of the environment that it needs, such as its
@@ -21,6 +21,7 @@ from jaxtyping import Float32
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
+from touchgoal.control.policy_server.policy import PolicyServer
 from touchgoal.runtime.errors import UserError
 
 Config = TypeVar("Config")
@@ -149,8 +150,13 @@ class UserPolicy:
         return found
 
 
-def find_user_policy(name: str) -> UserPolicy | None:
-    """Return the user's policy `module:Class` or `file.py:Class`; None for any other name."""
+def find_user_policy(name: str, instruction: str = "") -> UserPolicy | PolicyServer | None:
+    """Return the policy `module:Class`, `file.py:Class` or `ws://host:port`; None for other names.
+
+    `instruction` is what a server gets where no environment has one.
+    """
+    if name.startswith(("ws://", "wss://")):
+        return PolicyServer(name, instruction)
     _, colon, attribute = name.rpartition(":")
     return UserPolicy(name) if colon and attribute.isidentifier() else None
 

@@ -15,8 +15,8 @@ from touchgoal.policies.by_name import AnyPolicy, PolicyMaker, prepare_policy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, TaskConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE
@@ -120,7 +120,7 @@ def trial_specs(config: TaskConfig, count: int, seed: int) -> list[EpisodeSpec]:
 
 
 def run_trials(
-    config: TaskConfig, policy: PolicyMaker, specs: Sequence[EpisodeSpec], workers: int
+    config: TaskConfig, policy: PolicyMaker, specs: Sequence[EpisodeSpec], workers: Workers
 ) -> Iterator[Trial]:
     """Run a policy in each episode; yield the trials in order as they end.
 
@@ -130,9 +130,8 @@ def run_trials(
         for spec in track(specs, "trials", "episode"):
             yield run_trial(config, policy, spec)
         return
-    with one_core_workers(min(workers, len(specs))) as pool:
-        results = pool.map(partial(run_trial, config, policy), specs)
-        yield from track(results, "trials", "episode", total=len(specs))
+    with parallel_map(partial(run_trial, config, policy), specs, workers) as trials:
+        yield from track(trials, "trials", "episode", total=len(specs))
 
 
 def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Trial:

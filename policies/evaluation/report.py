@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from touchgoal.policies.by_name import PolicyMaker
 from touchgoal.policies.evaluation.evaluate import Evaluation, Trial
 from touchgoal.policies.evaluation.table import table, worst_first
 from touchgoal.runtime.json_file import write_json
-from touchgoal.runtime.worker_pool import one_core_workers
+from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.tasks import make_env
 
@@ -58,14 +59,14 @@ def film_trials(
     chosen = {"worst": ranked[0], "best": ranked[-1], "median": ranked[len(ranked) // 2]}
     names = list(chosen)[: len(ranked)]
     paths = [out / f"{name}.mp4" for name in names]
-    with one_core_workers(min(workers, len(names))) as pool:
-        count = len(names)
-        rows = [task] * count, [policy] * count, [chosen[name] for name in names], paths
-        for name, path, _ in zip(names, paths, pool.map(_film, *rows), strict=True):
+    jobs = [(chosen[name], path) for name, path in zip(names, paths, strict=True)]
+    with parallel_map(partial(_film, task, policy), jobs, workers) as filmed:
+        for name, path, _ in zip(names, paths, filmed, strict=True):
             print(f"{name} episode (seed {chosen[name].seed}): {path}")
 
 
-def _film(task: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec, path: Path) -> None:
+def _film(task: TaskConfig, policy: PolicyMaker, job: tuple[EpisodeSpec, Path]) -> None:
+    spec, path = job
     env = make_env(task)  # with the same images, because rendering them draws random numbers
     episode, images = record_with_film(env, spec, policy, meshes="fast")
     write_film(path, images, episode, task.control_hz)

@@ -1,6 +1,7 @@
 """Rendered starts of pick-place, on which the pose estimator is trained."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -8,8 +9,8 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from touchgoal.control import features as ft
+from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 
@@ -31,8 +32,8 @@ def render_placements(
 ) -> Placements:
     """Render objects of random shape and size, one for each seed from `seed` on, at several places."""
     seeds = range(seed, seed + objects)
-    with one_core_workers(workers) as pool:
-        rendered = pool.map(_render_object, [config] * objects, [placements_each] * objects, seeds)
+    render = partial(_render_object, config, placements_each)
+    with parallel_map(render, seeds, workers) as rendered:
         rows = [
             row for some in track(rendered, "rendering", "object", total=objects) for row in some
         ]

@@ -1,6 +1,7 @@
 """Embeddings of recorded episodes by a frozen encoder, cached inside the episode set."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -12,8 +13,8 @@ from jaxtyping import Float16
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.runtime.worker_pool import one_core_workers
 
 
 @runtime_checkable
@@ -29,7 +30,7 @@ class Embedder(Protocol):
 
 
 def embed_episodes(
-    episodes: EpisodeSet, chosen: Sequence[int], embedder: Embedder, workers: int = 1
+    episodes: EpisodeSet, chosen: Sequence[int], embedder: Embedder, workers: Workers = 1
 ) -> list[Float16[np.ndarray, "t ..."]]:
     """Return the embeddings of episodes, from the cache or made and cached.
 
@@ -57,23 +58,25 @@ def _cache_path(episodes: EpisodeSet, embedder: Embedder, i: int) -> Path:
 
 
 def _fill_cache(
-    episodes: EpisodeSet, chosen: Sequence[int], embedder: Embedder, workers: int
+    episodes: EpisodeSet, chosen: Sequence[int], embedder: Embedder, workers: Workers
 ) -> None:
     missing = [i for i in chosen if not _cache_path(episodes, embedder, i).exists()]
     if not missing:
         return
     _cache_path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
-    make = partial(_embed, episodes, embedder)
-    progress = partial(track, what="embedding", unit="episode", total=len(missing))
-    if workers == 1:
-        list(progress(map(make, missing)))
-        return
-    with one_core_workers(workers) as pool:
-        list(progress(pool.map(make, missing)))
+    embed = partial(_embed, episodes, embedder)
+    with (
+        nullcontext(map(embed, missing))
+        if workers == 1
+        else parallel_map(embed, missing, workers) as embedded
+    ):
+        counted = track(embedded, "embedding", "episode", total=len(missing))
+        for i, rows in zip(missing, counted, strict=True):
+            path = _cache_path(episodes, embedder, i)
+            with atomic_write(path) as unfinished, unfinished.open("wb") as file:
+                np.save(file, rows)
 
 
-def _embed(episodes: EpisodeSet, embedder: Embedder, i: int) -> None:
+def _embed(episodes: EpisodeSet, embedder: Embedder, i: int) -> Float16[np.ndarray, "t ..."]:
     torch.set_num_threads(1)
-    rows, path = embedder.embed(episodes, i).astype(np.float16), _cache_path(episodes, embedder, i)
-    with atomic_write(path) as unfinished, unfinished.open("wb") as file:
-        np.save(file, rows)
+    return embedder.embed(episodes, i).astype(np.float16)

@@ -8,6 +8,7 @@ from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.evaluation.evaluate import Evaluation, run_trials, trial_specs
 from touchgoal.policies.training.train import POLICY, SNAPSHOTS
 from touchgoal.runtime import seeds
+from touchgoal.runtime.parallel.parallel_map import Workers
 from touchgoal.sim_envs.config import TaskConfig
 
 Score = tuple[float, float]  # success rate, then mean progress; both in [0, 1]
@@ -35,7 +36,7 @@ def select(
     return scores
 
 
-def score(policy: Path, env: TaskConfig, trials: int, workers: int) -> Score:
+def score(policy: Path, env: TaskConfig, trials: int, workers: Workers) -> Score:
     """Return how well the policy in a folder does in a number of trials that choose a snapshot."""
     maker = SavedPolicy(policy)
     env = maker.env_config(env)

@@ -18,6 +18,7 @@ from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.parallel.parallel_map import Workers
 from touchgoal.runtime.progress import track
 
 
@@ -39,7 +40,7 @@ def load_recordings(
     chosen: Sequence[int],
     config: PolicyConfig,
     embedder: TouchEmbedder | None,
-    workers: int = 1,
+    workers: Workers = 1,
     skip: Sequence[int] | None = None,
 ) -> Recordings:
     """Read episodes, and embed those that have no embedding yet; a kill loses those in progress.

@@ -16,8 +16,8 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.runtime.atomic_write import write_file
-from touchgoal.runtime.progress import progress_bar
-from touchgoal.runtime.worker_pool import one_core_workers
+from touchgoal.runtime.parallel.parallel_map import parallel_map
+from touchgoal.runtime.progress import track
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class EmbeddedFiles:
         missing = [r for r in recorded if not self.path(r).exists()]
         if not missing:
             return
-        with (
-            one_core_workers(workers) as pool,
-            progress_bar("embedding", len(missing), "episode") as bar,
-        ):
-            for _ in pool.map(partial(_embed, self), missing):
-                bar.update()
+        with parallel_map(partial(_embed, self), missing, workers) as embedded:
+            counted = track(embedded, "embedding", "episode", total=len(missing))
+            for one, pickled in zip(missing, counted, strict=True):
+                path = self.path(one)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_file(path, pickled)
 
     def load(self, recorded: Recorded) -> EmbeddedEpisode:
         """Return an embedded episode."""
@@ -58,7 +58,7 @@ def load_embedder(encoder: str) -> EpisodeEmbedder:
     return EpisodeEmbedder(load_towers(touch.towers or "offline"), touch)
 
 
-def _embed(files: EmbeddedFiles, recorded: Recorded) -> None:
+def _embed(files: EmbeddedFiles, recorded: Recorded) -> bytes:
     torch.set_num_threads(1)
     episodes = EpisodeSet(recorded.root)
     i, embedder = recorded.index, load_embedder(files.encoder)
@@ -70,6 +70,4 @@ def _embed(files: EmbeddedFiles, recorded: Recorded) -> None:
         f"{recorded.root.name}#{i}",
         descriptions=embedder.knows_words,
     )
-    path = files.path(recorded)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, pickle.dumps(embedded))
+    return pickle.dumps(embedded)

@@ -28,8 +28,8 @@ from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import on_interruption
+from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.runtime.worker_pool import one_core_workers
 
 _READERS: dict[Recording, Callable[[EpisodeSet, int, Preprocessor], data.RigFrames]] = {
     "strokes": data.read_strokes,
@@ -102,10 +102,7 @@ def _encoder(name: str, sensor: str, config: Config) -> BaseTouchEncoder:
 def _run_recording(bench: Bench, what: Recording, reading: Reading) -> list[dict[str, Any]]:
     """Run all tasks on one kind of recordings; frames and tokens are freed afterwards."""
     tasks = [name for name in bench.config.tasks if RECORDED_AS[name] == what]
-    with (
-        tempfile.TemporaryDirectory(dir=bench.folder) as files,
-        one_core_workers(bench.config.workers) as workers,
-    ):
+    with tempfile.TemporaryDirectory(dir=bench.folder) as files:
         subjects, frames = _share(bench, tasks, reading, Path(files))
         jobs = [
             Job(subject, task, share, bench.config, bench.folder / "training.log")
@@ -113,8 +110,9 @@ def _run_recording(bench: Bench, what: Recording, reading: Reading) -> list[dict
             for task in tasks
             for share in bench.config.shares
         ]
-        judged = track(workers.map(work, jobs), "probes", "probe", total=len(jobs))
-        rows = list(chain.from_iterable(judged))
+        with parallel_map(work, jobs, bench.config.workers) as judged:
+            counted = track(judged, "probes", "probe", total=len(jobs))
+            rows = list(chain.from_iterable(counted))
     for name in tasks:
         rows += _references(name, TASKS[name](frames))
     return rows

@@ -13,8 +13,8 @@ from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import Preprocessor
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.cloths import CLOTHS
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import simulate
@@ -140,8 +140,7 @@ def read_cloths(clips: EpisodeSet, count: int, preprocess: Preprocessor) -> RigF
 def with_fields(frames: RigFrames, rig: RigConfig, workers: int) -> RigFrames:
     """Add the true field, simulated again from the same strokes."""
     count = int(frames.stroke[-1]) + 1
-    with one_core_workers(workers) as pool:
-        made = pool.map(partial(_field, rig), range(count))
+    with parallel_map(partial(_field, rig), range(count), workers) as made:
         fields = list(track(made, "force fields", "stroke", total=count))
     return replace(frames, field=torch.from_numpy(np.concatenate(fields)))
 

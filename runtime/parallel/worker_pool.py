@@ -35,11 +35,16 @@ def one_core_workers(workers: int) -> Iterator[ProcessPoolExecutor]:
     pool.shutdown()
 
 
-def _begin_work() -> None:
-    """Ignore Ctrl-C, which the parent handles; start no threads in OpenCV or software OpenGL."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def use_one_core() -> None:
+    """Start no threads in OpenCV or software OpenGL."""
     cv2.setNumThreads(1)
     os.environ["LP_NUM_THREADS"] = "1"
+
+
+def _begin_work() -> None:
+    """Ignore Ctrl-C, which the parent handles, and end with the parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    use_one_core()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -1,0 +1,76 @@
+"""Work on a Ray cluster of two nodes, one of which is lost, and on processes that are killed."""
+
+import math
+import multiprocessing
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from in_process import in_process_workers
+
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.launch.__main__ import main
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.parallel.parallel_map import parallel_map
+
+NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
+DEMOS = "collect-demos --episodes 4 --env.objects glass_ball --env.control-hz 10 --env.no-tactile"
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    Cluster = pytest.importorskip("ray.cluster_utils").Cluster
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")  # reports nothing to its makers
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # by default workers give way to everything else
+    cluster = Cluster(True, head_node_args={**NODE, "include_dashboard": False})
+    yield cluster
+    cluster.shutdown()
+
+
+def test_a_lost_node_changes_no_bit(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    local, on_ray, append = tmp_path / "local", tmp_path / "ray", EpisodeWriter.append
+    with in_process_workers():
+        main([*DEMOS.split(), "--out", str(local)])
+    nodes = [cluster.add_node(**NODE)]
+
+    def append_and_lose_a_node(writer: EpisodeWriter, episode: Any) -> None:
+        append(writer, episode)
+        if nodes:
+            cluster.remove_node(nodes.pop(), allow_graceful=False)
+
+    monkeypatch.setattr(EpisodeWriter, "append", append_and_lose_a_node)
+    main([*DEMOS.split(), "--ray", cluster.address, "--out", str(on_ray)])
+    assert not nodes
+    files = sorted(p for p in (local / "episodes").rglob("*") if p.is_file())
+    for file in files:
+        assert file.read_bytes() == (on_ray / file.relative_to(local)).read_bytes(), file
+    assert EpisodeSet(on_ray / "episodes").checksum == EpisodeSet(local / "episodes").checksum
+
+
+def test_errors_are_those_of_a_local_run(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with parallel_map(find_sensor, ["gelsight_mini", "none"], cluster.address) as sensors:
+        assert next(sensors) == find_sensor("gelsight_mini")
+        with pytest.raises(UserError, match="^none is no sensor"):
+            next(sensors)
+    refused = ["collect-demos", "--out", str(tmp_path), "--ray"]
+    with pytest.raises(SystemExit, match="--ray nowhere: .*start a cluster by"):
+        main([*refused, "nowhere"])
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(SystemExit, match="--ray needs Ray: pip install"):
+        main([*refused, cluster.address])
+
+
+def test_a_killed_process_loses_nothing() -> None:
+    with parallel_map(math.sqrt, range(100), 2) as roots:
+        first = next(roots)
+        for worker in multiprocessing.active_children():
+            worker.kill()
+        assert [first, *roots] == [math.sqrt(i) for i in range(100)]
