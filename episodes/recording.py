@@ -221,7 +221,7 @@ def collect(
     with closing(EpisodeWriter(root, fps=config.control_hz)) as writer:
         check_fits(writer, config)
         with (
-            parallel_map(partial(_record, config, roles), specs, workers) as recorded,
+            parallel_map(partial(record_encoded, config, roles), specs, workers) as recorded,
             progress_bar("recording", len(specs), "episode") as bar,
         ):
             for episode in recorded:
@@ -268,7 +268,8 @@ def _count(episodes: int, failures: Counter[str]) -> str:
     return text
 
 
-def _record(config: TaskConfig, roles: Roles, spec: EpisodeSpec) -> EncodedEpisode:
+def record_encoded(config: TaskConfig, roles: Roles, spec: EpisodeSpec) -> EncodedEpisode:
+    """Record one episode in an environment of its own."""
     env = make_env(config)
     try:
         return encode(record_episode(env, spec, roles), config.control_hz)

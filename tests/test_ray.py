@@ -20,15 +20,15 @@ NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
 DEMOS = "collect-demos --episodes 4 --env.objects glass_ball --env.control-hz 10 --env.no-tactile"
 
 
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
     Cluster = pytest.importorskip("ray.cluster_utils").Cluster
-
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")  # reports nothing to its makers
-    monkeypatch.setenv("RAY_worker_niceness", "0")  # by default workers give way to everything else
-    cluster = Cluster(True, head_node_args={**NODE, "include_dashboard": False})
-    yield cluster
-    cluster.shutdown()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")  # reports nothing to its makers
+        patch.setenv("RAY_worker_niceness", "0")  # by default workers give way to everything else
+        cluster = Cluster(True, head_node_args={**NODE, "include_dashboard": False})
+        yield cluster
+        cluster.shutdown()
 
 
 def test_a_lost_node_changes_no_bit(

@@ -64,7 +64,7 @@ def _fill_cache(
     if not missing:
         return
     _cache_path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
-    embed = partial(_embed, episodes, embedder)
+    embed = partial(embed_episode, episodes, embedder)
     with (
         nullcontext(map(embed, missing))
         if workers == 1
@@ -77,6 +77,7 @@ def _fill_cache(
                 np.save(file, rows)
 
 
-def _embed(episodes: EpisodeSet, embedder: Embedder, i: int) -> Float16[np.ndarray, "t ..."]:
+def embed_episode(episodes: EpisodeSet, embedder: Embedder, i: int) -> Float16[np.ndarray, "t ..."]:
+    """Embed all ticks of an episode on one thread."""
     torch.set_num_threads(1)
     return embedder.embed(episodes, i).astype(np.float16)
