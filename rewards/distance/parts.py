@@ -33,7 +33,7 @@ Costs = dict[str, Float[np.ndarray, " n"]]
 
 TOUCH_PARTS = ("object", "force", "centre", "held", "slip")
 FUSED, VALUE, WORDS, FORCE = "fused", "value", "words", "force"
-VALUE_SHARE = 0.3
+VALUE_SHARE = 0.4
 """Share of the value in a fused cost; the rest is the root mean square of the parts. Chosen, like the
 form of a part's cost, on objects that `benchmark reward-quality` does not judge on."""
 SMALLEST_UNIT = {
