@@ -12,8 +12,11 @@ from touchgoal.benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.force import calibrate_force, change_statistics, resized
+from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
 from touchgoal.encoders.probes.property_probe import interval
 from touchgoal.episodes.importers.force_grasps import ForceGrasp, read_force_grasps
+from touchgoal.rewards.features.contact_reading import ContactReader
+from touchgoal.rewards.metrics import spearman
 from touchgoal.runtime.option_types import RARE, Corners, Count, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
 
@@ -50,7 +53,26 @@ def run(config: Config) -> dict[str, Any]:
     embedders = {name: find_embedder(name, config.seed) for name in config.encoders}
     grasps = read_force_grasps(config.data, config.corners)[:: config.every]
     result = judge_grasps(grasps, embedders)
+    result["ranks"] = judge_depth(grasps) if config.corners else {}
     return {"table": force_table(result), **result}
+
+
+def judge_depth(grasps: list[ForceGrasp]) -> dict[str, float]:
+    """Return for each grasp how force from depth ranks its frames in contact as the load cell does.
+
+    It is the force that a reward's part compares, read without any calibration on a load cell.
+    """
+    ranks = {}
+    for grasp in track(grasps, "reading depth", "grasp"):
+        frames = grasp.frames()
+        readings = ContactReader(GELSIGHT_WEDGE, frames[:_FIRST], GELSIGHT_WEDGE.frame_rate).read(
+            frames
+        )
+        assert readings.force is not None  # the sensor has a file
+        force = grasp.force[: len(frames)]
+        in_contact = readings.touching[0] & (np.abs(force) < _IMPOSSIBLE)
+        ranks[grasp.trial] = spearman(readings.force[0][in_contact], force[in_contact])
+    return {trial: rank for trial, rank in ranks.items() if rank is not None}
 
 
 def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> dict[str, Any]:
@@ -121,6 +143,12 @@ def force_table(result: dict[str, Any]) -> str:
         lines.append(
             f"contact is detected {min(delay)} to {max(delay)} frames (median {np.median(delay):g}) after "
             f"{_PRESSED:g} N on the load cell, in {len(delay)} grasps that start open"
+        )
+    if result["ranks"]:
+        ranks = list(result["ranks"].values())
+        lines.append(
+            "force from the depth of the gel ranks the frames of a grasp as the load cell does: Spearman "
+            f"{np.median(ranks):.2f} (median; {min(ranks):.2f} to {max(ranks):.2f})"
         )
     lines += ["\n" + cost_table(cost, name) for name, cost in result["cost"].items()]
     return "\n".join(lines)
