@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.backbones.tower_map import TowerMap
+from touchgoal.encoders.compiled_network import CompiledNetwork
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
@@ -91,7 +92,9 @@ class PooledEncoder(BaseTouchEncoder):
         if config.image_dim:
             self.image_map = TowerMap(config.image_dim, config.features)
         self.requires_grad_(False)
-        self._network = [network or load_efficientnet_lite0()]  # in a list: no part of the state
+        stages = _Stages(network or load_efficientnet_lite0(), config.last_block)
+        self._stages = [stages]  # in a list: no part of the state
+        self._compiled = CompiledNetwork(stages)
 
     @property
     def device(self) -> torch.device:
@@ -144,9 +147,21 @@ class PooledEncoder(BaseTouchEncoder):
     @torch.no_grad()
     def pool(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
         """Return means and standard deviations over the image, stage by stage."""
-        network = self._network[0].to(touch.device)
-        blocks = list(network.blocks)[: self.config.last_block + 1]
-        return pool_stages(network.stem, blocks, draw(touch, self._scale))
+        images = draw(touch, self._scale)
+        if touch.device.type == "cpu":
+            return self._compiled(images)[0]
+        return self._stages[0].to(touch.device)(images)
+
+
+class _Stages(nn.Module):
+    """An ImageNet network up to a block, pooled stage by stage."""
+
+    def __init__(self, network: EfficientNetLite0, last_block: int) -> None:
+        super().__init__()
+        self.stem, self.blocks = network.stem, network.blocks[: last_block + 1]
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
+        return pool_stages(self.stem, self.blocks, images)
 
 
 def draw(touch: Float[Tensor, "n 3 h w"], scale: float) -> Float[Tensor, "n 3 h w"]:

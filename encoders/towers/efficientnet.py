@@ -111,6 +111,21 @@ class EfficientNetLite0(nn.Module):
         return self.classifier(self.features(x))
 
 
+class PooledAndMap(nn.Module):
+    """The network without its classifier."""
+
+    def __init__(self, network: EfficientNetLite0) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self, x: Float[Tensor, "n 3 h w"]
+    ) -> tuple[Float[Tensor, "n 1280"], Float[Tensor, "n 112 y x"]]:
+        """Return pooled features and the feature map at stride 16."""
+        features = self.network.map(x)
+        return self.network.finish(features), features
+
+
 def load_efficientnet_lite0() -> EfficientNetLite0:
     """Load the ImageNet network from the wheel, for inference.
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, Float16, UInt8
 from PIL import Image
 from torch import Tensor
 
+from touchgoal.encoders.compiled_network import CompiledNetwork
 from touchgoal.encoders.towers import efficientnet, minilm
 from touchgoal.encoders.towers.transformers_models import load_model, load_part
 from touchgoal.encoders.towers.wheels import wheel_folder
@@ -107,23 +108,28 @@ class OfflineTowers:
         """Return the sentence encoder."""
         return minilm.SentenceEncoder(self.device)
 
+    @cached_property
+    def _embed_pixels(self) -> Callable[[Tensor], tuple[Tensor, ...]]:
+        network = efficientnet.PooledAndMap(self.image_tower)
+        return CompiledNetwork(network) if self.device == "cpu" else network
+
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
         """Return pooled ImageNet features."""
-        network = self.image_tower  # load now, before threads use it
-        batches = self._in_batches(lambda pixels: network.features(pixels).cpu(), images)
+        embed = self._embed_pixels  # load now, before threads use it
+        batches = self._in_batches(lambda pixels: embed(pixels)[0].cpu(), images)
         return _joined(batches, self.image_dim)
 
     def embed_with_maps(
         self, images: UInt8[np.ndarray, "n h w 3"]
     ) -> tuple[Float[Tensor, "n d"], Float16[np.ndarray, "n c y x"]]:
         """Return pooled ImageNet features, and maps of 112 channels at stride 16."""
-        network = self.image_tower
+        embed = self._embed_pixels
 
-        def embed(pixels: Tensor) -> tuple[Tensor, Tensor]:
-            features = network.map(pixels)
-            return network.finish(features).cpu(), features.half().cpu()
+        def embed_both(pixels: Tensor) -> tuple[Tensor, Tensor]:
+            pooled, features = embed(pixels)
+            return pooled.cpu(), features.half().cpu()
 
-        batches = self._in_batches(embed, images)
+        batches = self._in_batches(embed_both, images)
         maps = np.concatenate([features.numpy() for _, features in batches])
         return _joined([pooled for pooled, _ in batches], self.image_dim), maps
 

@@ -1,0 +1,73 @@
+"""A frozen network compiled for the CPU by OpenVINO: torch's numbers to about 1e-5, in 0.4 of the time."""
+
+import os
+import sys
+import threading
+import warnings
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from touchgoal.encoders.towers.wheels import wheel_folder
+
+
+class CompiledNetwork:
+    """Runs a network that takes one batch of images and returns a tuple of tensors.
+
+    A call uses one core; calls from several threads run at the same time, up to the number of cores.
+    The network is compiled anew for each size of images, and must not change afterwards.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        """Take a network on the CPU, in evaluation mode; UserError if OpenVINO is missing."""
+        wheel_folder("openvino")
+        self._network = network
+        self._compiled: dict[tuple[int, int], Any] = {}
+        self._compiling, self._requests = threading.Lock(), threading.local()
+
+    def __reduce__(self) -> tuple[type["CompiledNetwork"], tuple[nn.Module]]:
+        """Copy and pickle the network; the copy compiles it anew."""
+        return CompiledNetwork, (self._network,)
+
+    def __call__(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
+        """Return the network's outputs, on the CPU."""
+        height, width = images.shape[2:]
+        found = self._request(height, width).infer([images.contiguous().numpy()])
+        return tuple(torch.from_numpy(found[i]) for i in range(len(found)))
+
+    def _request(self, height: int, width: int) -> Any:
+        """Return this thread's own request: a request runs once at a time."""
+        mine = self._requests.__dict__.setdefault("by_size", {})
+        if (height, width) not in mine:
+            with self._compiling:
+                if (height, width) not in self._compiled:
+                    self._compiled[height, width] = _compile(self._network, height, width)
+            mine[height, width] = self._compiled[height, width].create_infer_request()
+        return mine[height, width]
+
+
+@torch.no_grad()
+def _compile(network: nn.Module, height: int, width: int) -> Any:
+    # OpenVINO reports its use to its maker unless this is not there.
+    sys.modules.setdefault("openvino_telemetry", None)  # pyright: ignore[reportArgumentType]
+    import openvino
+    from openvino.frontend import FrontEndManager
+    from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # sizes become constants, as they should
+        traced = torch.jit.trace(network, torch.zeros(1, 3, height, width), check_trace=False)
+    decoder = TorchScriptPythonDecoder(traced)  # must outlive the conversion
+    frontend = FrontEndManager().load_by_framework("pytorch")
+    model = frontend.convert(frontend.load(decoder))
+    model.reshape([-1, 3, height, width])
+    cores = str(os.cpu_count())
+    config = {
+        "INFERENCE_PRECISION_HINT": "f32",  # else bfloat16 on some processors
+        "ENABLE_CPU_PINNING": False,  # else every process computes on the same core
+        "INFERENCE_NUM_THREADS": cores,
+        "NUM_STREAMS": cores,
+    }
+    return openvino.Core().compile_model(model, "CPU", config)
