@@ -1,8 +1,10 @@
 """Frozen towers: the offline pair against known answers, CLIP from a tiny local directory."""
 
 import json
+import pickle
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import matplotlib.cbook
@@ -12,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 
+from touchgoal.encoders.compiled_network import CompiledNetwork
 from touchgoal.encoders.towers import efficientnet, minilm
 from touchgoal.encoders.towers.towers import (
     ClipTowers,
@@ -104,6 +107,20 @@ def test_image_embedding_does_not_depend_on_the_batch(
     assert torch.get_num_threads() == 2 and not repeated.requires_grad
     torch.set_num_threads(threads)
     torch.testing.assert_close(repeated, together.repeat(3, 1), rtol=1e-4, atol=1e-4)
+
+
+def test_a_compiled_network_computes_what_torch_does_in_any_thread() -> None:
+    """Batches and sizes of images may differ; a copy computes the same, and nothing is reported."""
+    network = efficientnet.PooledAndMap(efficientnet.EfficientNetLite0().eval())
+    compiled = pickle.loads(pickle.dumps(CompiledNetwork(network)))
+    rng = torch.Generator().manual_seed(0)
+    images = [torch.rand(n, 3, h, 64, generator=rng) for n, h in ((1, 64), (3, 64), (2, 96))]
+    with ThreadPoolExecutor(2) as pool, torch.no_grad():
+        for ours, x in zip(pool.map(compiled, images * 2), images * 2, strict=True):
+            for mine, torchs in zip(ours, network(x), strict=True):
+                assert mine.shape == torchs.shape
+                assert mine == pytest.approx(torchs, abs=1e-4)
+    assert sys.modules["openvino_telemetry"] is None
 
 
 def test_missing_wheels_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
