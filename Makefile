@@ -23,13 +23,13 @@ test: $(READY)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not realtime" --durations 20
 	$(BIN)/python -m pytest -m realtime --durations 10
 
-# In an environment of their own: clients that are not ours (pylibfranka, franky, ur-rtde) on the twin, and
-# our driver on controllers that are not ours (franka-sim, which wants an older mujoco, and franky-sim).
+# Our driver on controllers that are not ours, in an environment of their own: franka-sim, which wants an older
+# mujoco, and franky-sim.
 interop: $(READY)
 	$(PYTHON) -m venv .venv-interop
-	.venv-interop/bin/pip install -q numpy pylibfranka franky-sim==1.0.4 "mujoco<3.3" trimesh
+	.venv-interop/bin/pip install -q numpy franky-sim==1.0.4 "mujoco<3.3" trimesh
 	.venv-interop/bin/pip install -q --no-deps franka-sim==1.1.7
-	$(BIN)/python tests/interop/run.py
+	$(BIN)/python tests/interop/emulators.py
 
 # Sets both ways between touchgoal and lerobot, and our policy in lerobot-eval; lerobot runs in an environment
 # of its own, under its own pins.

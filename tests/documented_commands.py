@@ -44,7 +44,7 @@ NOT_RUN = {
     "check-sensor": "needs a sensor and a person: test_own_sensor.py",
     "calibrate": "needs presses of a real sensor: test_calibration.py",
     "calibrate-camera": "needs a board: test_hand_eye.py",
-    "arm": "needs an arm: test_arm_commands.py",
+    "arm": "needs an arm: test_deploy.py",
     "push": "needs a hub: test_hub.py",
     "pull": "needs a hub: test_hub.py",
     "benchmark": "test_commands.py runs each at toy size",

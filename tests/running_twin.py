@@ -15,8 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from touchgoal.control.cell import twin_client
 from touchgoal.control.cell.cell_file import read_cell_file
 
@@ -90,10 +88,3 @@ def client(function: Callable, *arguments: object, using: Callable | None = None
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
-
-
-def yaw_of(pose: list[float]) -> float:
-    """Hand yaw that closes across a box, within an eighth of a turn."""
-    w, x, y, z = pose[3:]
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return float((yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4)

@@ -13,12 +13,7 @@ from toy_towers import PaintTowers, TogetherTowers
 
 from touchgoal.encoders.alignment.align import AlignedBatch, align, batch_losses
 from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig, Augmentation
-from touchgoal.encoders.alignment.data import (
-    TouchData,
-    augment,
-    prepare_touch_data,
-    split_by_episode,
-)
+from touchgoal.encoders.alignment.data import TouchData, prepare_touch_data, split_by_episode
 from touchgoal.encoders.alignment.retrieval import evaluate_retrieval, mean_average_precision, top1
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as PRESETS_VIT
@@ -97,27 +92,6 @@ def test_prepared_data_pairs_touch_with_object_and_view() -> None:
     with pytest.raises(UserError, match="'brush' has no descriptions"):
         unnamed = replace(TRAIN, descriptions={"ball": ["round"]})
         prepare_touch_data(unnamed, PaintTowers(), SENSOR, CONFIG.no_contact_texts)
-
-
-def test_augmentation() -> None:
-    touch = torch.randn(6, 3, 20, 30, generator=torch.Generator().manual_seed(0))
-
-    def changed(augmentation: Augmentation, seed: int = 1) -> torch.Tensor:
-        return augment(touch, augmentation, BatchNoise(torch.Generator().manual_seed(seed)))
-
-    assert torch.equal(changed(Augmentation()), touch)
-    everything = ALIGN_PRESETS["default"].augmentation
-    assert torch.equal(changed(everything), changed(everything))
-    assert not torch.equal(changed(everything), changed(everything, seed=2))
-    shifted = changed(Augmentation(shift=4))
-    inside = touch[:, :, 4:-4, 4:-4]
-    for before, after in zip(inside, shifted, strict=True):
-        windows = after.unfold(1, 12, 1).unfold(2, 22, 1)
-        gaps = (windows - before[:, None, None]).abs().amax((0, 3, 4))
-        assert gaps.min() == 0, "the middle of the picture is not found anywhere"
-    gained = changed(Augmentation(gain=0.2)) / touch
-    torch.testing.assert_close(gained, gained[:, :, :1, :1].expand_as(gained))
-    assert 0.8 <= gained.min() < 0.95 and 1.05 < gained.max() <= 1.2
 
 
 # ---- losses

@@ -12,7 +12,6 @@ import pytest
 
 from touchgoal.control.calibration.ball import ball_overlap, press_surface
 from touchgoal.control.calibration.calibrate import fit, median_background
-from touchgoal.control.calibration.press_fit import FitState, PressFit
 from touchgoal.control.calibration.press_set import (
     PressSet,
     read_presses,
@@ -88,27 +87,6 @@ def test_ball_touches_where_it_is_said_to() -> None:
     assert (x, y) == pytest.approx((80, 60), abs=0.1)
     curved = overlap[60, 80] - overlap[60, 90]
     assert curved == pytest.approx(BALL - np.sqrt(BALL**2 - (10 * PITCH) ** 2), rel=1e-3)
-
-
-def test_squares_of_the_place_are_fitted_and_stored(tmp_path: Path) -> None:
-    """A response that falls off to both sides comes back from presses with it, not without."""
-    linear = known_sensor()
-    falloff = np.zeros((3, sensor_calibration.N_FEATURES, 2), np.float32)
-    falloff[:, :2, 0] = -0.6 * linear.response[:, :2, 0]
-    true = replace(linear, response=np.concatenate([linear.response, falloff], 2))
-    sensor_calibration.save(true, tmp_path, {})
-    assert json.loads((tmp_path / "sensor.json").read_text())["format"] == 3
-    stored = sensor_calibration.load(tmp_path)
-    np.testing.assert_allclose(stored.response, true.response, rtol=1e-6)
-    presses = made_presses(stored, 24)
-    errors = []
-    for start in (linear, true):
-        blank = replace(start, response=np.zeros_like(start.response))
-        steps = PressFit(presses, stored.background, True, 1.0, trust_labels=True)
-        found = steps.fit_response(FitState(blank, presses.circles, presses.ball_radius))
-        wrong = found.calibration.response[:, :2, :3] - true.response[:, :2, :3]
-        errors.append(np.abs(wrong).mean())
-    assert errors[1] < 0.5 * errors[0]
 
 
 @pytest.mark.slow

@@ -264,7 +264,6 @@ class Hostile:
         (b"\x80\x04\x8c\x02o\n\x8c\x06system\x93.", r"asks for o\\n\.system"),
         (b"", "no pickle of plain values"),
         (pickle.dumps(VALUE) + b"more", "damaged"),
-        (b"\x80\x04\x8e" + b"\xff" * 8 + b".", "damaged"),
     ],
 )
 def test_anything_else_is_one_line(tmp_path: Path, data: bytes, message: str) -> None:
@@ -276,3 +275,14 @@ def test_anything_else_is_one_line(tmp_path: Path, data: bytes, message: str) ->
         read_plain_pickle(path)
     assert "\n" not in str(refused.value)
     assert not Path("/tmp/it_ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("lost", "message"),
+    [("digit_01", "10 images, .* labels 16: get all its files"), ("slip_forces", "is missing")],
+)
+def test_a_batch_that_is_not_whole_is_one_line(tmp_path: Path, lost: str, message: str) -> None:
+    write_force_batch(tmp_path / "sphere" / "batch_1")
+    (tmp_path / "sphere" / "batch_1" / f"dataset_{lost}.pkl").unlink()
+    with pytest.raises(UserError, match=message):
+        next(read_strokes(tmp_path))

@@ -161,28 +161,6 @@ def test_the_hand_moves_as_asked_and_yields_to_what_it_presses_on() -> None:
     np.testing.assert_allclose(moved, [0, 0, TICK * (2e-3 * 7 - 0.02)], atol=1e-5)
 
 
-def test_the_script_picks_places_and_says_how_it_ended() -> None:
-    """In free space, with a hand that goes where it is asked and closes on 40 mm."""
-    position, width = np.array([0.4, 0.1, 0.3]), 0.08
-    device = ScriptedDevice(PickPlacePoses((0.5, 0.0, 0.03, 0.0), (0.5, -0.1)))
-    closed_at = None
-    for _ in range(1000):
-        state = np.zeros(15, np.float32)
-        state[-1] = width
-        pose = np.array([*position, 0.0, 1.0, 0.0, 0.0], np.float32)  # fingers down
-        motion = device.read({ft.TCP_POSE: pose, ft.STATE: state})
-        assert np.abs(motion.twist).max() <= 1
-        position = position + 0.1 * TICK * motion.twist[:3]
-        width = max(0.04, width - 0.01) if motion.gripper == "close" else 0.08
-        if closed_at is None and width == 0.04:
-            closed_at = position.copy()
-        if device.verdict:
-            break
-    assert device.verdict == "done" and closed_at is not None
-    np.testing.assert_allclose(closed_at, [0.5, 0.0, 0.03], atol=0.005)
-    np.testing.assert_allclose(position, [0.5, -0.1, 0.03], atol=0.005)
-
-
 CELL = """
 arm = "sim"
 gripper = { kind = "franka_hand" }
@@ -256,3 +234,25 @@ def test_recording_needs_a_person(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(SystemExit, match="nobody is there to lead the arm"):
         run("record-demos", cell, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_script_picks_places_and_says_how_it_ended() -> None:
+    """In free space, with a hand that goes where it is asked and closes on 40 mm."""
+    position, width = np.array([0.4, 0.1, 0.3]), 0.08
+    device = ScriptedDevice(PickPlacePoses((0.5, 0.0, 0.03, 0.0), (0.5, -0.1)))
+    closed_at = None
+    for _ in range(1000):
+        state = np.zeros(15, np.float32)
+        state[-1] = width
+        pose = np.array([*position, 0.0, 1.0, 0.0, 0.0], np.float32)  # fingers down
+        motion = device.read({ft.TCP_POSE: pose, ft.STATE: state})
+        assert np.abs(motion.twist).max() <= 1
+        position = position + 0.1 * TICK * motion.twist[:3]
+        width = max(0.04, width - 0.01) if motion.gripper == "close" else 0.08
+        if closed_at is None and width == 0.04:
+            closed_at = position.copy()
+        if device.verdict:
+            break
+    assert device.verdict == "done" and closed_at is not None
+    np.testing.assert_allclose(closed_at, [0.5, 0.0, 0.03], atol=0.005)
+    np.testing.assert_allclose(position, [0.5, -0.1, 0.03], atol=0.005)

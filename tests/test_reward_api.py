@@ -139,7 +139,6 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["0.mp4", "--fps", "10"], "states its own frame rate: leave --fps out"),
         (["0.mp4", "--device", "warp"], "--device warp cannot be used here"),
         (["0.mp4", "--goal", "episode:episodes#3"], "has episodes 0 to 2"),
-        (["0.mp4", "--encoder", "gelsight_mini"], "has no touch: leave the encoder out"),
         (["one.mp4"], "has one frame: a curve needs at least 2"),
         (["episodes", "--camera", "wrist"], "choose --camera observation.images.front"),
     ],
@@ -263,3 +262,13 @@ def test_a_cell_chooses_the_encoder_of_its_rewards(tmp_path: Path) -> None:
     cell.write_text(text.replace("[task]", f"[task]\n{words}"))
     with pytest.raises(UserError, match="was not aligned with texts"):
         load_cell_cost(read_cell_file(cell))
+
+
+def test_fit_normalizer_wants_known_successes(
+    run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(run_folder)
+    for _ in range(2):
+        EpisodeWriter(Path("unknown")).append(replace(EPISODE, meta={"sensor": "gelsight_mini"}))
+    with pytest.raises(SystemExit, match="2 of 2 episodes of unknown have no recorded outcome"):
+        main(["fit-normalizer", "unknown", "--out", "y"])

@@ -168,7 +168,7 @@ def test_touch_goals_are_ends_with_the_same_object() -> None:
         fit_scene([apple, pear], ["tactile"])
 
 
-def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
+def test_scale_refuses_what_would_mislead() -> None:
     good = embedded("good")
     lost = replace(good, touch=direction([[90.0] * 20 + [140.0] * 20] * 2))
     held = replace(good, touch=direction([[90.0] * 20 + [60.0] * 20] * 2))
@@ -179,7 +179,6 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
         ([replace(miss, success=True) for miss in misses], "tactile", "'tactile'"),
         ([good, misses[0]], "image", "a failed"),
         ([good, other], "image", "other encoders"),
-        ([], "image", "at least one"),
     ]
     for episodes, modality, message in cases:
         with pytest.raises(UserError, match=message):
@@ -190,9 +189,6 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
     own_camera = replace(good, made_with=EmbeddingSource("towers", camera=""))
     picture = replace(goal_of(good), touch=None, text=None)
     assert compute_curves(own_camera, picture, normalizer).normalised  # a plain video, vouched for
-    (tmp_path / "broken.json").write_text("{")
-    with pytest.raises(UserError, match="is not a normalizer"):
-        DistanceNormalizer.load(tmp_path / "broken.json")
 
 
 @pytest.mark.parametrize("what", ["towers", "camera", "encoder", "sensor"])

@@ -88,13 +88,9 @@ def test_a_wrong_file_is_refused_with_the_keys_that_do_not_fit(tmp_path: Path) -
     save_file(other, path)
     with pytest.raises(UserError, match="frequency_bands are not 10000"):
         load_sparsh(path)
-    save_file(published(stored=100), path)
-    with pytest.raises(UserError, match=r"100, 192\) positions, which fit neither.*224, 224\)"):
-        load_sparsh(path)
     (tmp_path / "a.ckpt").write_bytes(b"no")
-    for name in ("a.ckpt", "missing.ckpt"):
-        with pytest.raises(UserError, match=name):
-            load_sparsh(tmp_path / name)
+    with pytest.raises(UserError, match="a.ckpt"):
+        load_sparsh(tmp_path / "a.ckpt")
 
 
 UPRIGHT, SQUARE = (320, 240), (224, 224)

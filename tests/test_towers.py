@@ -13,6 +13,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from PIL import Image
+from safetensors.torch import load_file, save_file
 
 from touchgoal.encoders.compiled_network import CompiledNetwork
 from touchgoal.encoders.towers import efficientnet, minilm
@@ -207,3 +208,12 @@ def test_unknown_towers_are_one_line(
     with pytest.raises(UserError, match=message) as error:
         load_towers(name)
     assert "\n" not in str(error.value)
+
+
+def test_incomplete_weights_are_refused(tmp_path: Path) -> None:
+    clip = make_clip(tmp_path)
+    weights = load_file(clip / "model.safetensors")
+    del weights["text_projection.weight"]
+    save_file(weights, clip / "model.safetensors", {"format": "pt"})
+    with pytest.raises(UserError, match="incomplete"):
+        load_towers(str(clip))

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from running_twin import RunningTwin, client, yaw_of
+from running_twin import RunningTwin, client
 
 from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.twin.franka.limits import Setpoint, joint_fault
@@ -92,57 +92,6 @@ def test_franka_holds_clients_to_its_limits(fr3: RunningTwin) -> None:
     assert result["held"] < 0.02
     worst = fr3.ask("truth")["worst"]
     assert worst["excess"] <= 0 and worst["speed"] < 1
-
-
-def picks(address: str, home: list[float], position: list[float], yaw: float) -> dict:
-    """Closes on air, then on the object, and lifts it; first our driver meets it on a way part in."""
-    import franky
-
-    from touchgoal.control.grippers.franka_hand import FrankaHandClient
-
-    robot, driver = connect(address), FrankaHandClient(address, 20.0)
-    gripper = driver._hand  # a hand takes one client
-    robot.relative_dynamics_factor = 0.6
-    robot.move(franky.JointMotion(home))
-    air = gripper.grasp(0.03, 0.1, 20.0)
-    opened = gripper.open(0.1)
-    half = [np.cos(yaw / 2), np.sin(yaw / 2), 0.0, 0.0]  # x, y, z, w: about x, then yaw
-    for height in (0.12, 0.0):
-        at = franky.Affine([position[0], position[1], position[2] + height], half)
-        robot.move(franky.CartesianMotion(at))
-    driver.tick()
-    driver.command(0.01)
-    end = time.monotonic() + 20
-    while not driver.read().grasped and time.monotonic() < end:
-        driver.tick()
-        time.sleep(driver.period)
-    met = driver.read()
-    gripper.open(0.1)
-    start = time.monotonic()
-    grasped = gripper.grasp(0.04, 0.04, 20.0, 0.04, 0.04)
-    took = time.monotonic() - start
-    up = franky.Affine([0, 0, -0.12])
-    robot.move(franky.CartesianMotion(up, franky.ReferenceType.Relative))
-    time.sleep(0.5)
-    found = {"air": air, "opened": opened, "grasped": grasped and gripper.is_grasped, "took": took}
-    force, met = list(robot.state.O_F_ext_hat_K), [met.grasped, met.width, met.fault]
-    return {"met": met, "width": gripper.width, "force": force, **found}
-
-
-def test_franka_grasps_what_is_there(fr3: RunningTwin) -> None:
-    fr3.begin('reset 3 {"object": "wooden_block", "mass": 0.1}')
-    pose = fr3.ask("truth")["layout"]["object"]
-    position = [*pose[:2], max(pose[2], 0.0185)]
-    result = through_franky(picks, fr3, position, yaw_of(pose))
-    assert not result["air"] and result["opened"] and result["grasped"]
-    grasped, width, fault = result["met"]
-    assert grasped and abs(width - result["width"]) < 2e-3 and fault == ""
-    truth = fr3.ask("truth")
-    assert truth["layout"]["object"][2] > 0.1
-    np.testing.assert_allclose(truth["pad_forces"], 20.0, rtol=0.05)
-    assert abs(truth["width"] - result["width"]) < 1e-4
-    assert abs(result["force"][2] - 0.1 * 9.81) < 0.1  # the robot holds it up: the maker's sign
-    assert result["took"] > 0.5 * (0.08 - result["width"]) / 0.04  # it keeps to the speed asked for
 
 
 @pytest.mark.parametrize("joint", range(7))

@@ -1,11 +1,16 @@
 """Our driver of the FR3 and of its hand against simulated controllers that are not ours.
 
-Each runs in `.venv-interop`, in real time; franka-sim aborts what breaks the FCI's motion limits.
+    python tests/interop/emulators.py [NAME ...]      NAME: franka-sim, franky-sim; none: both
+
+Each runs in `.venv-interop` (`make interop` makes it), in real time; franka-sim aborts what breaks the FCI's
+motion limits. Clients that are not ours (franky, ur-rtde) drive the twin in test_twin_clients.py.
 """
 
 import os
 import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -15,6 +20,8 @@ from touchgoal.control.grippers.franka_hand import FrankaHand
 from touchgoal.control.interfaces import ArmReading, DriverError
 from touchgoal.control.safety.limits import FR3
 
+HERE = Path(__file__).parent
+PYTHON = HERE.parents[1] / ".venv-interop" / "bin" / "python"
 HZ, SECONDS = 20.0, 10.0
 _SWING = 0.2 * np.array([1, 0.5, -1, 1, 1, -1, 1])  # rad, there and back in 4 s
 _PERIOD = 4.0  # s
@@ -31,12 +38,13 @@ COMMANDS = {
 }
 
 
-def drive(name: str, python: str, folder: str, number: int) -> tuple[dict[str, bool], str]:
-    """Drive a controller; return the checks and figures. `python`: of the environment; `folder`: the server's."""
-    address = f"127.{60 + number}.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
+def drive(name: str) -> tuple[dict[str, bool], str]:
+    """Drive a controller; return the checks and figures."""
+    network = 80 + list(COMMANDS).index(name)
+    address = f"127.{network}.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
     command = [part.format(address=address) for part in COMMANDS[name]]
     server = subprocess.Popen(
-        [python, *command], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [PYTHON, *command], cwd=HERE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     try:
         arm = _connect(server, address)
@@ -102,3 +110,17 @@ def _wait(arm: ArmProcess, seconds: float) -> None:
     end = arm.read().time + seconds
     while arm.read().time < end:
         time.sleep(0.05)
+
+
+def main() -> None:
+    right = True
+    for name in sys.argv[1:] or COMMANDS:
+        found, figures = drive(name)
+        checks = ", ".join(f"{what} {'ok' if ok else 'WRONG'}" for what, ok in found.items())
+        print(f"{name}: {figures}\n{name}: {checks}", flush=True)
+        right &= all(found.values())
+    sys.exit(0 if right else 1)
+
+
+if __name__ == "__main__":
+    main()
