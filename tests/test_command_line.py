@@ -23,12 +23,7 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import on_interruption, terminable
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.runtime.run_folder import check_writable, open_run
-from touchgoal.sim_envs.config import (
-    BeadMazeConfig,
-    PickPlaceConfig,
-    TaskConfig,
-    TaskName,
-)
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
 ENVS = {"pick-place": PickPlaceConfig(), "bead-maze": BeadMazeConfig(split="validation")}
 

@@ -130,19 +130,6 @@ def test_multi_positive_is_the_mean_over_right_answers() -> None:
 # ---- touch encoder
 
 
-def test_embeddings_are_unit_vectors_of_one_space() -> None:
-    rng = np.random.default_rng(0)
-    encoder, towers = make_encoder(), PaintTowers()
-    frames = rng.integers(0, 256, (70, 60, 80, 3)).astype(np.uint8)
-    touch = encoder.embed_frames(frames, frames[0])
-    assert touch.shape == (70, 16)
-    for rows in (touch, encoder.embed_text_goal(["soft", "a hard ball"], towers)):
-        np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, rtol=1e-5)
-        assert rows.shape[1] == 16
-    one = encoder.embed_frames(frames[69:], frames[0])
-    np.testing.assert_allclose(one[0], touch[69], atol=1e-5)
-
-
 # ---- files
 
 

@@ -16,7 +16,7 @@ from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBack
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.rewards.distance.embedding_distance import compute_curves, compute_distances
+from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
 from touchgoal.rewards.goals import (
     GoalPicture,
@@ -53,22 +53,6 @@ def embedder() -> EpisodeEmbedder:
     config = TouchEncoderConfig.for_towers(PRESETS["tiny"], towers, "gelsight_mini", 16)
     encoder = TouchEncoder(config)
     return EpisodeEmbedder(towers, encoder)
-
-
-def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:
-    e = embedder.embed_episode(recorded(), 20.0, "mine", descriptions=True)
-    assert e.modalities == ALL and (e.object, e.success) == ("apple", True)
-    goal = assign_goals([OwnFrame(), Sentence("hard and smooth")], e.modalities)
-    curves = compute_curves(e, embedder.embed_goal(goal, e), None)
-    assert set(curves.raw) == set(ALL) and not curves.normalised
-    assert curves.raw["image"][-1] == pytest.approx(0, abs=1e-6)
-    assert np.ptp(curves.raw["tactile"][:7]) < 1e-6 < 1e-4 < curves.raw["tactile"][0]
-    assert curves.raw["tactile"][7:] == pytest.approx(np.zeros(5), abs=1e-6)
-    assert e.descriptions is not None
-    assert embedder.embed_goal(goal, e).text == pytest.approx(e.descriptions[:1], abs=1e-6)
-
-    third = embedder.embed_goal(assign_goals([OwnFrame(3)], e.modalities), e)
-    assert compute_distances(e, third)["image"].argmin() == 3
 
 
 def test_goals_from_a_picture_and_from_another_episode(

@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from touchgoal.benchmarks.real_touch import forces, markers
 from touchgoal.benchmarks.real_touch.embedders import find_embedder
@@ -23,7 +22,6 @@ from touchgoal.encoders.probes.property_probe import (
     sentences_right,
 )
 from touchgoal.encoders.towers.towers import OfflineTowers
-from touchgoal.encoders.whitening.text_head import RANK_WORDS, fit_text_head, rank_sentences
 from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video
@@ -96,24 +94,6 @@ def test_sentences_are_judged_on_objects_never_seen() -> None:
     noise, embed_texts = rng.normal(size=(120, 30)), OfflineTowers().embed_texts
     assert sentences_right(embedded + 0.3 * noise, ranks, objects, embed_texts).mean() > 0.9
     assert sentences_right(noise, ranks, objects, embed_texts).mean() < 0.5
-
-
-def test_sentences_lie_where_what_they_tell_of_is_felt() -> None:
-    """Touches along orthogonal directions; a combination of ranks held out of the fit is named."""
-    rng = np.random.default_rng(0)
-    directions = rng.normal(size=(3, 3, 40))
-    ranks = np.array([[i, j, k] for i in range(3) for j in range(3) for k in range(3)])
-    touch = directions[0, ranks[:, 0]] + directions[1, ranks[:, 1]] + directions[2, ranks[:, 2]]
-    unseen = (ranks == (0, 2, 1)).all(1)
-    towers = OfflineTowers()
-    centred = torch.from_numpy(touch - touch.mean(0)).float()
-    head = fit_text_head(centred[~unseen], torch.from_numpy(ranks[~unseen]), towers.embed_texts)
-    for k in range(3):
-        near = centred[unseen] @ head(towers.embed_texts(rank_sentences(k))).T
-        assert near.argmax() == ranks[unseen][0, k]
-    words = [w[r] for w, r in zip(RANK_WORDS, (0, 2, 1), strict=True)]
-    whole = towers.embed_texts([f"a {word} object" for word in words])
-    assert (head(whole).sum(0) @ centred.T).argmax() == np.flatnonzero(unseen)[0]
 
 
 def test_the_benchmark_takes_a_hugging_face_model(tmp_path: Path) -> None:

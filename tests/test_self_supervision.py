@@ -174,14 +174,6 @@ def test_a_collapsed_training_saves_nothing(
     assert "WARNING: the embeddings have collapsed" in capsys.readouterr().out
 
 
-def test_force_is_read_from_a_saved_encoder(tmp_path: Path) -> None:
-    train, val = moving_blobs(48, 0), moving_blobs(24, 1)
-    encoder = train_unlabelled(train, val, DINO, tmp_path, TrainerOptions(), {})
-    metrics = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")["metrics"]
-    assert metrics["reconstruction"] > 0.3 and metrics["force_z_r2"] > 0.3
-    assert pretrained.load_encoder(tmp_path / "encoder").config == encoder.config
-
-
 def test_moments_hold_the_true_past(tmp_path: Path) -> None:
     greys = 16 * np.arange(6, dtype=np.uint8)[:, None, None, None]
     pictures = np.broadcast_to(greys, (6, 240, 320, 3)).copy()

@@ -21,9 +21,7 @@ from touchgoal.benchmarks.papers.tacbench.data import (
 from touchgoal.benchmarks.papers.tacbench.force import field_metrics, force_metrics
 from touchgoal.benchmarks.papers.tacbench.labels import grasp_task, label_metrics, textile_task
 from touchgoal.benchmarks.papers.tacbench.pose import PoseTask
-from touchgoal.benchmarks.papers.tacbench.published_recordings import (
-    find_published,
-)
+from touchgoal.benchmarks.papers.tacbench.published_recordings import find_published
 from touchgoal.benchmarks.papers.tacbench.slip import f1_score, slip_metrics
 from touchgoal.benchmarks.papers.tacbench.task import split_force, split_grasp, split_slip
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
