@@ -115,17 +115,17 @@ def _jobs(config: Config, root: Path) -> Iterator[Job]:
 
 def _measure(job: Job, workers: Workers, cores: int) -> Measured:
     times, size, waited = [], 0, 0.0
-    start, spent = time.perf_counter(), time.process_time()
+    start, spent = time.perf_counter(), 0.0
     with parallel_map(job.work, job.items, workers) as results:
         for result in results:
             began, own = time.perf_counter(), time.process_time()
             job.take(result)
             now = time.perf_counter()
-            times.append(now - start)
             waited += now - began - (time.process_time() - own)  # for the disk
-            size = size or len(pickle.dumps(result))
+            if not times:  # the start is over
+                size, waited, spent = len(pickle.dumps(result)), 0.0, time.process_time()
+            times.append(now - start)
         spent = time.process_time() - spent
-    total = sum(job.counts)
     return Measured(
         job=job.name,
         unit=job.unit,
@@ -133,7 +133,7 @@ def _measure(job: Job, workers: Workers, cores: int) -> Measured:
         cores=cores,
         rate=sum(job.counts[cores:]) / (times[-1] - times[cores - 1]),
         first=times[0],
-        ceiling=total / (spent + waited),
+        ceiling=sum(job.counts[1:]) / (spent + waited),
         size=size / job.counts[0],
     )
 
@@ -152,12 +152,13 @@ def _table(rows: Sequence[Measured]) -> str:
             f"{_median(r.first for r in two):>17.1f}"
         )
         if ray:
-            ceiling, size = _median(r.ceiling for r in one + two), _median(r.size for r in one)
+            # With one core of two at work this process has the other to itself.
+            ceiling, size = _median(r.ceiling for r in one), _median(r.size for r in one)
             reached = "".join(f"{min(n * rate, ceiling):>10,.0f}" for n in MODEL)
             model.append(f"{f'{job}, {unit}':<33}{reached}")
             model.append(
                 f"  the writing process: at most {ceiling:,.0f} {unit}/s, {ceiling / rate:,.0f} cores, "
-                f"{ceiling * size / 1e6:,.0f} MB/s"
+                f"{ceiling * size / 1e6:.3g} MB/s"
             )
     return "\n".join([*lines, "", *model])
 

@@ -35,7 +35,7 @@ class RayCluster:
     def result(self, reference: Any) -> Any:
         """Wait for a result; raise what the function raised, UserError if its workers died."""
         try:
-            return self.ray.get(reference)
+            return reference.future().result()  # `ray.get` takes SIGTERM for Ctrl-C
         except self.ray.exceptions.RayTaskError as error:
             raise error.cause from error
         except self.ray.exceptions.RayError as error:
