@@ -15,6 +15,10 @@ import numpy as np
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.benchmarks.papers.reward_quality import tables
 from touchgoal.benchmarks.papers.reward_quality.claims import judge_claims
+from touchgoal.benchmarks.papers.reward_quality.early_stopping import (
+    judge_stopping,
+    stopping_text,
+)
 from touchgoal.benchmarks.papers.reward_quality.embedding import EmbeddedFiles
 from touchgoal.benchmarks.papers.reward_quality.judging import Judge, fit_judge
 from touchgoal.benchmarks.papers.reward_quality.measures import (
@@ -110,7 +114,9 @@ def _judge_scene(judge: Judge, recorded: Sequence[Recorded]) -> tuple[dict[str, 
         for outcome, episodes in judged.items()
     }
     margins = _margins(judge, test, curves)
-    threshold, passed = _threshold(judge, recorded, judged)
+    demonstrations = judge.judge([r for r in recorded if r.purpose == "calibration"])
+    threshold, passed = _threshold(demonstrations, judged)
+    stopping = judge_stopping(demonstrations, judged, judge.files.load(test[0]).fps)
     audited = [r for r in test if r.outcome in _AUDITED]
     audit = audit_touch(
         [judge.files.load(r) for r in audited],
@@ -127,6 +133,7 @@ def _judge_scene(judge: Judge, recorded: Sequence[Recorded]) -> tuple[dict[str, 
             tables.intervals(found | ordered, curves),
             tables.diagonals(margins),
             tables.threshold(threshold, passed),
+            stopping_text(stopping),
             audit.table,
             text,
         ]
@@ -138,6 +145,7 @@ def _judge_scene(judge: Judge, recorded: Sequence[Recorded]) -> tuple[dict[str, 
         "rank": tables.as_json(ranks),
         "diagonal": margins,
         "success": vars(threshold) | {"accepted": passed},
+        "early_stopping": stopping,
         "audit": {"verdict": audit.verdict, "rows": [vars(row) for row in audit.rows]},
         "claims": [vars(c) for c in claims],
         "units": judge.normalizer.unit,
@@ -163,11 +171,10 @@ def _margins(
 
 
 def _threshold(
-    judge: Judge, recorded: Sequence[Recorded], judged: dict[str, list[Judged]]
+    demonstrations: Sequence[Judged], judged: dict[str, list[Judged]]
 ) -> tuple[Any, dict[str, float]]:
     """Return the success threshold, and the share of each outcome that it accepts."""
-    calibration = judge.judge([r for r in recorded if r.purpose == "calibration"])
-    threshold = fit_success([e.last(FUSED) for e in calibration])
+    threshold = fit_success([e.last(FUSED) for e in demonstrations])
     return threshold, {
         outcome: float(np.mean([threshold.accepts(e.last(FUSED)) for e in episodes]))
         for outcome, episodes in judged.items()
