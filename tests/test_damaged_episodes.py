@@ -197,3 +197,13 @@ def test_killed_in_the_first_episode(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "no whole episode" in repair(tmp_path)[-1]
     record(tmp_path, range(2))
     assert validate(tmp_path) == []
+
+
+def test_a_flipped_letter_in_the_name_of_a_feature_is_repaired(small: Path) -> None:
+    text = (small / set_files.INFO).read_text()
+    (small / set_files.INFO).write_text(text.replace(ft.WRIST, ft.WRIST.replace("wrist", "wrast")))
+    for use in (EpisodeSet, EpisodeWriter):
+        with pytest.raises(UserError, match="unknown feature .*wrast.* touchgoal repair --fix"):
+            use(small)
+    assert validate(small) and repair(small) and validate(small) == []
+    assert_holds(small, [0, 1, 2])

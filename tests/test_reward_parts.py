@@ -3,14 +3,16 @@
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from toy_towers import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, WRIST
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.embedding_distance import compute_curves
-from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
+from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, fit_units
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.rewards.distance.parts import (
     contact_distances,
@@ -26,7 +28,10 @@ from touchgoal.rewards.features.contact_reading import ContactReader, ContactRea
 from touchgoal.rewards.features.embedded import CameraFeatures, EmbeddedEpisode, goal_at_every_frame
 from touchgoal.rewards.features.slip import SlipMeter
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
+from touchgoal.rewards.goals import Goal, GoalPicture, OwnFrame
 from touchgoal.rewards.online.failure_watch import FailureWatch
+from touchgoal.rewards.online.reward_wrapper import TouchReward, inputs_of
+from touchgoal.rewards.reward_model import load_reward_model
 from touchgoal.rewards.value.fit_value import fit_value
 from touchgoal.rewards.value.value import Value
 from touchgoal.runtime.errors import UserError
@@ -193,6 +198,13 @@ def test_goals_that_differ_widen_the_unit(successes: list[EmbeddedEpisode]) -> N
     assert costs[1] < 0.1 < costs[0]
 
 
+def test_units_are_those_of_ends_with_the_same_object(successes: list[EmbeddedEpisode]) -> None:
+    units = fit_units(successes)
+    assert units["force"] < 0.3 and units["held"] == pytest.approx(1 / 3)
+    strangers = [replace(e, object=str(i)) for i, e in enumerate(successes)]
+    assert fit_units(strangers) == {}
+
+
 def test_a_value_is_refused_elsewhere(successes: list[EmbeddedEpisode], value: Value) -> None:
     fitted = "simulated pick-place", (FRONT, WRIST), "offline"
     assert value.mismatch(*fitted) is None
@@ -242,6 +254,45 @@ def test_ends_are_a_goal_that_is_saved_and_chosen_by_object(
     last = [part_distances(embedded(9), end) for end in ends_one_by_one]
     for name, d in mine.items():
         assert d == pytest.approx(np.concatenate([one[name] for one in last], 1), abs=1e-6), name
+
+
+class _Reaching(gym.Env):
+    """A bright square that moves right, one step each; nothing touches the fingertips."""
+
+    observation_space = gym.spaces.Dict({FRONT: gym.spaces.Box(0, 255, (32, 32, 3), np.uint8)})
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple:
+        self.at = 0
+        return self.see(), {}
+
+    def step(self, action: np.ndarray) -> tuple:
+        self.at += int(action[0] > 0)
+        return self.see(), 7.0, False, False, {}
+
+    def see(self) -> dict[str, np.ndarray]:
+        picture = np.full((32, 32, 3), 60, np.uint8)
+        picture[12:20, self.at : self.at + 8] = 200
+        return {FRONT: picture}
+
+
+def test_the_cost_rewards_an_environment() -> None:
+    """A step towards the goal pays what the cost falls by; holding still pays nothing."""
+    env = _Reaching()
+    env.at = 12
+    specs = [GoalPicture(env.see()[FRONT])]
+    model = load_reward_model(inputs_of(env), specs, towers=PaintTowers(), normalizer="none")
+    rewarded = TouchReward(env, model)
+    _, info = rewarded.reset(seed=0)
+    paid = [rewarded.step(np.array([a]))[1] for a in (*[1.0] * 12, 0, 0, 0)]
+    assert sum(paid) == pytest.approx(info["cost"])
+    assert paid[12:] == [0, 0, 0]
+    by_state = TouchReward(env, model, form="state")
+    by_state.reset(seed=0)
+    _, reward, _, _, info = by_state.step(np.array([1.0]))
+    assert reward == -info["cost"] < 0 and info["task_reward"] == 7.0
+    with pytest.raises(UserError, match="not known before the end"):
+        TouchReward(env, replace(model, goal=Goal(image=OwnFrame())))
 
 
 def test_a_run_whose_cost_has_risen_for_a_second_has_failed() -> None:

@@ -2,6 +2,8 @@
 
 import json
 import re
+import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -221,3 +223,35 @@ def test_a_recording_for_rerun(episodes: Path, tmp_path: Path) -> None:
         rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
     for part in ("front", "tactile_left", "tactile_right", "curves/cost_image"):
         assert rows[f"/episode_000/{part}"] == trajectories[0].length
+
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+ACTIONS = """
+<script>
+const key = (name) => document.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));
+key("ArrowLeft");
+const scrubbed = byId("time").textContent;
+key("ArrowDown");
+[...document.querySelectorAll("th")].find((cell) => cell.textContent === "outcome").click();
+const rows = [...byId("table").tBodies[0].rows].map((row) => row.dataset.name);
+document.title = JSON.stringify({scrubbed, chosen: byId("name").textContent, rows,
+  paths: document.querySelectorAll("#chart path").length});
+</script>
+"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on the path")
+def test_page_in_a_browser(pages: Callable[..., Path], tmp_path: Path) -> None:
+    page = pages(100)
+    acted = tmp_path / "acted.html"
+    acted.write_text(page.read_text().replace("</body>", f"{ACTIONS}</body>"))
+    command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+    profile = f"--user-data-dir={tmp_path / 'profile'}"
+    done = subprocess.run(
+        [*command, profile, acted.as_uri()], capture_output=True, text=True, timeout=120
+    )
+    found = re.search(r"<title>(.*?)</title>", done.stdout)
+    assert found, done.stderr
+    result = json.loads(found[1].replace("&quot;", '"'))
+    assert result["scrubbed"].endswith("frame 10") and result["chosen"] == "set#1"
+    assert result["rows"][0] == "episode_002" and result["paths"] >= 1

@@ -1,6 +1,7 @@
 """Cameras over a real MJPEG stream, real files and USB: newest frame, rate, stall, freeze, return, replug."""
 
 import itertools
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -335,3 +336,14 @@ def test_exposure_and_white_balance_are_locked_or_refused(monkeypatch: pytest.Mo
     plugged.keeps = 99.0
     with pytest.raises(UserError, match="keeps exposure 99 instead of 120"):
         VideoCamera(VideoConfig("0", exposure=120.0))
+
+
+def test_opencv_is_quiet_only_while_a_camera_is_open(streamer: Streamer) -> None:
+    before = cv2.utils.logging.getLogLevel()
+    cameras = [VideoCamera(VideoConfig(streamer.url, rate=50.0)) for _ in range(2)]
+    cameras[0].close()
+    assert cv2.utils.logging.getLogLevel() == cv2.utils.logging.LOG_LEVEL_FATAL
+    cameras[1].close()
+    cameras[1].close()
+    assert cv2.utils.logging.getLogLevel() == before
+    assert "OPENCV_FFMPEG_LOGLEVEL" not in os.environ
