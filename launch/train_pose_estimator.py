@@ -1,4 +1,7 @@
-"""Train the pose estimator of pick-place on rendered scenes, for another camera or light."""
+"""Train the pose estimator of pick-place on rendered scenes, for another camera or light.
+
+Each scene has up to four objects; a sentence says which one is meant.
+"""
 
 import os
 from dataclasses import replace
@@ -17,10 +20,10 @@ class Config(TrainerOptions):
 
     out: Path | None = None
     """Folder of the run; the pose estimator goes to its `estimator/`."""
-    objects: Count = 1200
-    """Number of objects, of random shape and size, to render."""
-    placements: Count = 12
-    """Number of places on the table for each object."""
+    scenes: Count = 420
+    """Number of scenes to render, each of four objects of random shape and size."""
+    placements: Count = 30
+    """Renderings of each scene: objects moved and painted, some of them hidden."""
     train: PoseTrainConfig = PoseTrainConfig()
     """Epochs, learning rate, noise."""
     pose_estimator: Annotated[PoseEstimatorConfig, RARE] = PoseEstimatorConfig()
@@ -40,30 +43,34 @@ def main(config: Config) -> None:
     from touchgoal.encoders.training.trainer import is_first_process
     from touchgoal.policies.perception.placements import render_placements
     from touchgoal.policies.perception.pose_estimator import PoseEstimator
-    from touchgoal.policies.perception.pose_training import pose_errors, train_pose_estimator
+    from touchgoal.policies.perception.pose_training import (
+        error_table,
+        pose_errors,
+        train_pose_estimator,
+    )
     from touchgoal.policies.perception.state_estimation import ESTIMATOR_FORMAT
     from touchgoal.runtime import seeds
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.provenance import provenance
 
     check_run(config, config.out)
-    first_seed = seeds.POSE_TRAINING.first(config.objects, "--objects")
+    first_seed = seeds.POSE_TRAINING.first(config.scenes, "--scenes")
     out = open_training(config, "train-pose-estimator")
     torch.manual_seed(config.seed)
     network, known = PoseEstimator(config.pose_estimator), provenance()
     cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in config.pose_estimator.crops)
     size = config.pose_estimator.size
     env = replace(config.env, tactile=False, cameras=cameras, camera_size=size)
-    rendered = render_placements(env, config.objects, config.placements, first_seed, config.workers)
+    rendered = render_placements(env, config.scenes, config.placements, first_seed, config.workers)
     train_pose_estimator(network, rendered, config.train, out, config, known)
     if not is_first_process():
         return
-    few = max(1, config.objects // 8)
-    others = render_placements(env, few, 5, seeds.POSE_VALIDATION.start, config.workers)
+    few = max(1, config.scenes // 8)
+    first = seeds.POSE_VALIDATION.start
+    others = render_placements(env, few, 10, first, config.workers, painted=0.0)
     errors = pose_errors(network, others)
-    known |= {"objects": config.objects, "errors": errors}
+    known |= {"scenes": config.scenes, "errors": errors}
     ESTIMATOR_FORMAT.save_half(network, out / "estimator", network.config, known)
     write_json(out / "metrics.json", errors)
-    for name, (middle, most) in errors.items():
-        print(f"{name.replace('_', ', ')}: {middle:.1f} (median), {most:.1f} (90 %)")
+    print(error_table(errors))
     print(f"pose estimator: {out / 'estimator'}")

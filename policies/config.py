@@ -103,8 +103,13 @@ class PoseEstimatorConfig:
     crops: tuple[tuple[str, Box], ...] = ((ft.FRONT, (104, 232, 16, 240)),)
     """Crop of each camera's images that shows the table: column of the episodes, then rows and
     columns (from, to; from, to), px."""
+    finder_channels: Count = 48
+    """Feature maps of the first look, which finds object and goal; cells of 8 x 8 pixels."""
+    look: Count = 64
+    """Side of the second look, a square around each of them, px. It must hold the largest object
+    where the first look is a cell off."""
     channels: Count = 32
-    """Feature maps; each of their cells covers 4 x 4 pixels."""
+    """Feature maps of the second look; each of their cells covers 4 x 4 pixels."""
     dilations: tuple[Count, ...] = (1, 2, 4)
     """Dilation of each further layer, cells. Together they must cover the largest object: its shape
     shows its height."""
@@ -120,7 +125,7 @@ class PoseEstimatorConfig:
 class PoseTrainConfig:
     """Training of the pose estimator, by AdamW."""
 
-    epochs: Count = 20
+    epochs: Count = 14
     """Passes over the placements."""
     batch_size: Count = 64
     """Placements in each step."""

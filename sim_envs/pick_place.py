@@ -6,7 +6,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
@@ -134,10 +134,14 @@ class PickPlace(FrankaTactileEnv):
         super()._let_settle()
         self._note_start()
 
+    def start_of(self, name: str) -> Float32[np.ndarray, "7"]:
+        """Return `features.TRUTH_START` as if this object were the one to place."""
+        position, twice = self.object_pose(name)[:3], 2 * self.grasp_yaw(name)
+        return np.array([*position, np.cos(twice), np.sin(twice), *self.goal], np.float32)
+
     def _note_start(self) -> None:
-        position, twice = self.object_pose()[:3], 2 * self.grasp_yaw()
-        self.start = np.array([*position, np.cos(twice), np.sin(twice), *self.goal], np.float32)
-        self._initial_distance = max(self._tcp_distance(position), 1e-3)
+        self.start = self.start_of("object")
+        self._initial_distance = max(self._tcp_distance(self.start[:3]), 1e-3)
         self._still_ticks, self._lifted, self._put_down = 0, False, False
 
     def _info(self, progress: float, success: bool) -> dict[str, Any]:

@@ -1,59 +1,130 @@
 """Rendered starts of pick-place, on which the pose estimator is trained."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, Int64, UInt8
 from torch import Tensor
 
 from touchgoal.control import features as ft
+from touchgoal.policies.perception.target_words import COLOURS, Look, sentence
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 
+MOST = 4  # objects on the table
+_ALONE = 0.4  # share of the placements with one object
+_COLOUR_NOISE = 0.04  # standard deviation of a painted colour, of [0, 1]
+
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """Starts of n episodes."""
+    """Starts of n episodes, each with up to k objects on the table, any of which may be the target.
+
+    An object that is not there, or that no sentence tells from the others, has sentence -1.
+    """
 
     pictures: dict[str, UInt8[Tensor, "n h w 3"]]  # camera images by column
     tcp: Float32[Tensor, "n 7"]  # pose of the hand, `features.TCP_POSE`
-    start: Float32[Tensor, "n 7"]  # true poses, `features.TRUTH_START`
+    start: Float32[Tensor, "n k 7"]  # true poses with each as target, `features.TRUTH_START`
+    # of each object's centre, and last of the goal's, in each camera image: row and column, px
+    pixels: dict[str, Float32[Tensor, "n k+1 2"]]
+    objects: Int64[Tensor, " n"]  # number of objects on the table; they come first of the k
+    sentence: Int64[Tensor, "n k"]  # row in `sentences`
+    sentences: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.start)
 
 
 def render_placements(
-    config: PickPlaceConfig, objects: int, placements_each: int, seed: int, workers: int
+    config: PickPlaceConfig,
+    scenes: int,
+    placements_each: int,
+    seed: int,
+    workers: int,
+    painted: float = 0.5,
 ) -> Placements:
-    """Render objects of random shape and size, one for each seed from `seed` on, at several places."""
-    seeds = range(seed, seed + objects)
-    render = partial(_render_object, config, placements_each)
+    """Render scenes of objects of random shape and size, each at several places.
+
+    Seeds count up from `seed`. The share `painted` of the objects has another colour than its kind.
+    """
+    config = replace(config, distractors=MOST - 1)
+    seeds = range(seed, seed + scenes)
+    render = partial(_render_scene, config, placements_each, painted)
     with parallel_map(render, seeds, workers) as rendered:
-        rows = [
-            row for some in track(rendered, "rendering", "object", total=objects) for row in some
-        ]
+        rows = [row for some in track(rendered, "rendering", "scene", total=scenes) for row in some]
+    said = sorted({words for row in rows for words in row["words"] if words})
+    number = {words: i for i, words in enumerate(said)} | {None: -1}
     keys = [key for key in ft.CAMERAS if key in rows[0]]
-    columns = {
-        key: torch.from_numpy(np.stack([row[key] for row in rows]))
-        for key in (*keys, ft.TCP_POSE, ft.TRUTH_START)
-    }
-    tcp, start = columns.pop(ft.TCP_POSE), columns.pop(ft.TRUTH_START)
-    return Placements(columns, tcp, start)
+    return Placements(
+        pictures={key: _column(rows, key) for key in keys},
+        tcp=_column(rows, ft.TCP_POSE),
+        start=_column(rows, "start"),
+        pixels={key: _column(rows, f"pixels.{key}") for key in keys},
+        objects=torch.tensor([row["objects"] for row in rows]),
+        sentence=torch.tensor([[number[words] for words in row["words"]] for row in rows]),
+        sentences=tuple(said),
+    )
 
 
-def _render_object(
-    config: PickPlaceConfig, placements_each: int, seed: int
-) -> list[dict[str, np.ndarray]]:
+def _column(rows: list[dict[str, Any]], key: str) -> Tensor:
+    return torch.from_numpy(np.stack([row[key] for row in rows]))
+
+
+def _render_scene(
+    config: PickPlaceConfig, placements_each: int, painted: float, seed: int
+) -> list[dict[str, Any]]:
     env = PickPlace(config)
-    observation, info = env.reset(seed=seed)
-    rows = [observation | info]
-    for _ in range(placements_each - 1):
-        observation, info = env.rearrange()
-        rows.append(observation | info)
+    env.reset(seed=seed)
+    rng = env.np_random.spawn(1)[0]
+    rows = [_render_placement(env, rng, painted) for _ in range(placements_each)]
     env.close()
     return rows
+
+
+def _render_placement(env: PickPlace, rng: np.random.Generator, painted: float) -> dict[str, Any]:
+    """Paint some objects, hide others, move all of them, and render them."""
+    count = 1 if rng.random() < _ALONE else int(rng.integers(2, MOST + 1))
+    order = rng.permutation(MOST)
+    shown = [env.bodies[i] for i in order[:count]]
+    looks = []
+    for body in env.bodies:
+        rgb, paint = body.kind.material.rgba[:3], bool(rng.random() < painted)
+        if paint:
+            name = list(COLOURS)[rng.integers(len(COLOURS))]
+            rgb = np.clip(rng.normal(COLOURS[name], _COLOUR_NOISE), 0, 1)
+        env.model.geom(body.name).rgba[:] = *rgb, float(body in shown)
+        if body in shown:
+            looks.append(Look(body.kind, tuple(map(float, rgb)), paint))
+    shown.sort(key=env.bodies.index)
+    observation, _ = env.rearrange()
+    row: dict[str, Any] = dict(observation)
+    starts = np.stack([env.start_of(body.name) for body in shown])
+    row["start"], row["objects"] = _padded(starts), count
+    goal = np.append(env.goal, 0.0)
+    for camera in env.config.cameras:
+        seen = np.stack([_pixel(env, camera, pose[:3]) for pose in starts])
+        both = np.concatenate([_padded(seen), _pixel(env, camera, goal)[None]])
+        row[f"pixels.{ft.IMAGE_PREFIX}{camera}"] = both.astype(np.float32)
+    words = [sentence(rng, look, [*looks[:i], *looks[i + 1 :]]) for i, look in enumerate(looks)]
+    row["words"] = [*words, *[None] * (MOST - count)]
+    return row
+
+
+def _padded(rows: Float[np.ndarray, "m d"]) -> Float32[np.ndarray, "k d"]:
+    padded = np.zeros((MOST, rows.shape[1]), np.float32)
+    padded[: len(rows)] = rows
+    return padded
+
+
+def _pixel(env: PickPlace, camera: str, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
+    """Return the row and column (px) where a camera sees a point of the base frame (m)."""
+    at, (rows, columns) = env.data.camera(camera), env.config.camera_size
+    x, y, z = at.xmat.reshape(3, 3).T @ (point - at.xpos)  # x right, y up, z back
+    focal = rows / 2 / np.tan(np.radians(env.model.camera(camera).fovy[0]) / 2)  # px
+    return np.array([rows / 2 + focal * y / z, columns / 2 - focal * x / z])

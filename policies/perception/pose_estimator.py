@@ -1,4 +1,8 @@
-"""Pose estimator: a network from an episode's first camera images to object and goal poses."""
+"""Pose estimator: a network from an episode's first camera images to object and goal poses.
+
+It looks twice: a coarse map scores where the named object and the goal are; a crop around each, at
+full resolution, gives their poses.
+"""
 
 import torch
 import torch.nn.functional as F
@@ -7,46 +11,93 @@ from torch import Tensor, nn
 
 from touchgoal.control import features as ft
 from touchgoal.policies.actions import Normalizer
-from touchgoal.policies.config import PoseEstimatorConfig
+from touchgoal.policies.config import Box, PoseEstimatorConfig
 from touchgoal.policies.perception.keypoints import keypoints
+from touchgoal.policies.perception.target_words import WORDS_WIDTH
 
 _START = ft.FEATURES[ft.TRUTH_START].shape[0]
+_PARTS = (5, 2)  # numbers of `features.TRUTH_START` on the object and on the goal
 _TCP = ft.FEATURES[ft.TCP_POSE].shape[0]
+_PATCH = 4  # px between two cells of a crop
+_CELL = 8  # px between two cells of a finder's map
+_PEAK = 1.5  # cells around a map's maximum over which the place is averaged
+# Centre of the first cell, px: that of the 8 pixels of its patch, which begin at -2.
+_FIRST = 1.5
+
+Pictures = dict[str, UInt8[Tensor, "b h w 3"]]
+Places = dict[str, Float[Tensor, "b 2 2"]]
+"""Row and column (px) of the object and of the goal in each camera image."""
 
 
 class PoseEstimator(nn.Module):
-    """Network from the first camera images to `features.TRUTH_START`."""
+    """Network from the first camera images, and the object in words, to `features.TRUTH_START`."""
 
     def __init__(self, config: PoseEstimatorConfig) -> None:
         """Initialise at random; fit the normalizers before training."""
         super().__init__()
         self.config = config
-        self.networks = nn.ModuleList(_SpatialSoftmax(config) for _ in config.crops)
+        self.finders = nn.ModuleList(_Finder(config, box) for _, box in config.crops)
+        self.looks = nn.ModuleList(
+            nn.ModuleList(_SpatialSoftmax(config) for _ in _PARTS) for _ in config.crops
+        )
         width = _TCP + config.keypoints * (2 + config.keypoint_features) * len(config.crops)
         self.tcp_normalizer, self.start_normalizer = Normalizer((_TCP,)), Normalizer((_START,))
-        self.head = nn.Sequential(
-            nn.Linear(width, config.width), nn.Mish(),
-            nn.Linear(config.width, config.width), nn.Mish(),
-            nn.Linear(config.width, _START),
-        )  # fmt: skip
+        self.heads = nn.ModuleList(_head(width, config.width, part) for part in _PARTS)
 
     def forward(
-        self, pictures: dict[str, UInt8[Tensor, "b h w 3"]], tcp: Float[Tensor, "b 7"]
+        self, pictures: Pictures, tcp: Float[Tensor, "b 7"], words: Float[Tensor, "b d"]
     ) -> Float[Tensor, "b 7"]:
-        """Return the estimate: m, base frame."""
-        return self.start_normalizer.inverse(self.scaled(pictures, tcp))
+        """Return the estimate: m, base frame.
+
+        `words` are `target_words.embed`; zeros where nothing is said and one object is there.
+        """
+        places = {
+            key: finder.find(scores)
+            for (key, scores), finder in zip(
+                self.scores(pictures, words).items(), self.finders, strict=True
+            )
+        }
+        return self.start_normalizer.inverse(self.scaled(pictures, tcp, places))
+
+    def scores(
+        self, pictures: Pictures, words: Float[Tensor, "b d"]
+    ) -> dict[str, Float[Tensor, "b 2 y x"]]:
+        """Return logits of where the object and the goal are in each camera image."""
+        return {
+            key: finder(pictures[key], words)
+            for (key, _), finder in zip(self.config.crops, self.finders, strict=True)
+        }
+
+    def place_shares(self, places: Places) -> dict[str, Float[Tensor, "b 2 y x"]]:
+        """Return the targets of `scores`: what each cell should hold of a place."""
+        return {
+            key: finder.shares(places[key])
+            for (key, _), finder in zip(self.config.crops, self.finders, strict=True)
+        }
 
     def scaled(
-        self, pictures: dict[str, UInt8[Tensor, "b h w 3"]], tcp: Float[Tensor, "b 7"]
+        self, pictures: Pictures, tcp: Float[Tensor, "b 7"], places: Places
     ) -> Float[Tensor, "b 7"]:
-        """Return the estimate, normalised to variance 1."""
-        parts = [self.tcp_normalizer(tcp)]
-        for (key, (top, bottom, left, right)), network in zip(
-            self.config.crops, self.networks, strict=True
-        ):
-            crop = pictures[key][:, top:bottom, left:right].permute(0, 3, 1, 2)
-            parts.append(network(crop.float() / 64 - 2))
-        return self.head(torch.cat(parts, 1))
+        """Return the estimate from crops around these places, normalised to variance 1."""
+        estimate = []
+        for part, head in enumerate(self.heads):
+            found = [self.tcp_normalizer(tcp)]
+            for (key, _), looks in zip(self.config.crops, self.looks, strict=True):
+                found.append(looks[part](pictures[key], places[key][:, part]))
+            estimate.append(head(torch.cat(found, 1)))
+        return torch.cat(estimate, 1)
+
+
+def _head(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(inputs, width), nn.Mish(),
+        nn.Linear(width, width), nn.Mish(),
+        nn.Linear(width, outputs),
+    )  # fmt: skip
+
+
+def _pixels(pictures: UInt8[Tensor, "b h w 3"]) -> Float[Tensor, "b 3 h w"]:
+    return pictures.permute(0, 3, 1, 2).float() / 64 - 2
 
 
 class _Surroundings(nn.Module):
@@ -61,17 +112,79 @@ class _Surroundings(nn.Module):
         return maps + self.mix(F.relu(self.around(F.relu(maps))))
 
 
+class _Finder(nn.Module):
+    """Scores of the cells of a camera image: those of the object in words, and of the goal."""
+
+    def __init__(self, config: PoseEstimatorConfig, box: Box) -> None:
+        super().__init__()
+        self.box, width = box, config.finder_channels
+        self.patches = nn.Conv2d(3, width // 2, 8, _PATCH, 2)
+        self.cells = nn.Conv2d(width // 2, width, 3, _CELL // _PATCH, 1)
+        self.surroundings = nn.Sequential(_Surroundings(width, 1), _Surroundings(width, 2))
+        self.keys = nn.Conv2d(width, width, 1)
+        self.queries = nn.Parameter(torch.randn(2, width) / width**0.5)  # any object; the goal
+        self.words = nn.Linear(WORDS_WIDTH, width, bias=False)
+
+    def forward(
+        self, pictures: UInt8[Tensor, "b h w 3"], words: Float[Tensor, "b d"]
+    ) -> Float[Tensor, "b 2 y x"]:
+        top, bottom, left, right = self.box
+        maps = self.patches(_pixels(pictures[:, top:bottom, left:right]))
+        maps = self.keys(F.relu(self.surroundings(self.cells(F.relu(maps)))))
+        queries = self.queries.expand(len(maps), -1, -1)
+        queries = queries + torch.stack([self.words(words), torch.zeros_like(queries[:, 1])], 1)
+        return torch.einsum("bqc,bcyx->bqyx", queries, maps)
+
+    def _centres(self, shape: torch.Size) -> Float[Tensor, "y x 2"]:
+        """Return row and column (px) of the centre of each cell of a map."""
+        h, w = shape[-2:]
+        rows = self.box[0] + _FIRST + _CELL * torch.arange(h)
+        columns = self.box[2] + _FIRST + _CELL * torch.arange(w)
+        return torch.stack(torch.meshgrid(rows, columns, indexing="ij"), -1).to(self.queries)
+
+    def shares(self, places: Float[Tensor, "b 2 2"]) -> Float[Tensor, "b 2 y x"]:
+        """Return a share of each cell, by its distance from the place; they sum to 1."""
+        top, bottom, left, right = self.box
+        centres = self._centres(torch.Size([(bottom - top) // _CELL, (right - left) // _CELL]))
+        far = (places[:, :, None, None] - centres).square().sum(-1) / _CELL**2
+        return (-far / 2).flatten(2).softmax(2).view_as(far)
+
+    def find(self, scores: Float[Tensor, "b 2 y x"]) -> Float[Tensor, "b 2 2"]:
+        """Return the places (px): the mean over the cells around the highest score."""
+        centres = self._centres(scores.shape).flatten(0, 1)
+        peak = centres[scores.flatten(2).argmax(2)]
+        near = (peak[:, :, None] - centres).norm(dim=-1) <= _PEAK * _CELL
+        share = scores.flatten(2).masked_fill(~near, -torch.inf).softmax(2)
+        return share @ centres
+
+
 class _SpatialSoftmax(nn.Module):
-    """Keypoints of an image: the place of each, in [-1, 1], and its features."""
+    """Keypoints of a crop: the place of each, in [-1, 1] of the whole image, and its features."""
 
     def __init__(self, config: PoseEstimatorConfig) -> None:
         super().__init__()
         width = config.channels
-        self.patches = nn.Conv2d(3, width, 8, 4, 2)
+        self.side, self.count = config.look, config.keypoints
+        self.patches = nn.Conv2d(3, width, 8, _PATCH, 2)
         self.surroundings = nn.Sequential(*(_Surroundings(width, d) for d in config.dilations))
         self.attention = nn.Conv2d(width, config.keypoints, 1)
         self.features = nn.Conv2d(width, config.keypoint_features, 1)
 
-    def forward(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b p"]:
-        maps = F.relu(self.surroundings(self.patches(pictures)))
-        return keypoints(self.attention(maps), self.features(maps))
+    def forward(
+        self, pictures: UInt8[Tensor, "b h w 3"], places: Float[Tensor, "b 2"]
+    ) -> Float[Tensor, "b p"]:
+        size = torch.tensor(pictures.shape[1:3], device=places.device)
+        corner = (places - self.side / 2).round().long()
+        corner = corner.clamp(min=0).minimum(size - self.side)
+        crops = torch.stack(
+            [
+                picture[y : y + self.side, x : x + self.side]
+                for picture, (y, x) in zip(pictures, corner.tolist(), strict=True)
+            ]
+        )
+        maps = F.relu(self.surroundings(self.patches(_pixels(crops))))
+        points = keypoints(self.attention(maps), self.features(maps)).unflatten(1, (self.count, -1))
+        within, features = points.split([2, points.shape[2] - 2], 2)
+        reach = (self.side - _PATCH) / 2  # px from the crop's middle to its outermost cells
+        px = corner.flip(1)[:, None] + _FIRST + reach * (within + 1)
+        return torch.cat([2 * px / size.flip(0) - 1, features], 2).flatten(1)

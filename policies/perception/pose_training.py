@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor, nn
 
 from touchgoal.encoders.training.batch_noise import BatchNoise
@@ -16,8 +16,13 @@ from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.policies.config import Box, PoseTrainConfig
 from touchgoal.policies.perception.placements import Placements
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
+from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
 
 _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose counts linearly
+_FINDER_ROWS = 3  # the first look, which learns faster, is trained on one of so many samples
+_WORD_NOISE = 0.015  # standard deviation of each number of a sentence's embedding of length 1
+_PLACE_NOISE = 8.0  # px by which crops are off in training: a cell of the first look
+_BATCH = 64
 
 
 def train_pose_estimator(
@@ -29,16 +34,30 @@ def train_pose_estimator(
     recipe: dict[str, Any],
 ) -> None:
     """Train the pose estimator; writes what `trainer.fit` does."""
+    there = torch.arange(placements.start.shape[1]) < placements.objects[:, None]
     estimator.tcp_normalizer.fit_mean_std(placements.tcp)
-    estimator.start_normalizer.fit_mean_std(placements.start)
+    estimator.start_normalizer.fit_mean_std(placements.start[there])
+    embedded = embed(placements.sentences) if placements.sentences else torch.empty(0, WORDS_WIDTH)
 
     def batch(rows: Tensor, noise: BatchNoise) -> dict[str, Any]:
-        pictures = {
-            key: _add_pixel_noise(placements.pictures[key][rows], box, config.pixel_noise, noise)
-            for key, box in estimator.config.crops
+        target = (noise.rand((len(rows),)) * placements.objects[rows]).long()
+        words, told = _words(placements, embedded, rows, target, noise)
+        return {
+            "pictures": {
+                key: _add_pixel_noise(
+                    placements.pictures[key][rows], box, config.pixel_noise, noise
+                )
+                for key, box in estimator.config.crops
+            },
+            "tcp": placements.tcp[rows],
+            "start": placements.start[rows, target],
+            "places": _places(placements, rows, target),
+            "words": words,
+            "told": told,
+            "off": _PLACE_NOISE * (2 * noise.rand((len(rows), 2, 2)) - 1),
         }
-        return {"pictures": pictures, "tcp": placements.tcp[rows], "start": placements.start[rows]}
 
+    tensors = (*placements.pictures.values(), *placements.pixels.values())
     training = Training(
         loss=_PoseLoss(estimator),
         n_samples=len(placements),
@@ -49,9 +68,9 @@ def train_pose_estimator(
         identity={
             "train": asdict(config),
             "pose_estimator": asdict(estimator.config),
-            "data": checksum(*placements.pictures.values(), placements.tcp, placements.start),
+            "data": checksum(*tensors, placements.tcp, placements.start, placements.sentence),
         },
-        progress=lambda metrics: f"pose: loss {metrics['loss']:.4f}",
+        progress=lambda m: f"pose: loss {m['pose']:.4f}, first look {m['find']:.3f}",
     )
     fit(training, out_dir, options, recipe)
     estimator.cpu()
@@ -62,10 +81,62 @@ class _PoseLoss(nn.Module):
         super().__init__()
         self.estimator = estimator
 
-    def forward(self, pictures: dict[str, Tensor], tcp: Tensor, start: Tensor) -> dict[str, Tensor]:
-        predicted = self.estimator.scaled(pictures, tcp)
+    def forward(
+        self,
+        pictures: dict[str, Tensor],
+        tcp: Tensor,
+        start: Tensor,
+        places: dict[str, Tensor],
+        words: Tensor,
+        told: Tensor,
+        off: Tensor,
+    ) -> dict[str, Tensor]:
+        near = {key: place + off for key, place in places.items()}
+        predicted = self.estimator.scaled(pictures, tcp, near)
         target = self.estimator.start_normalizer(start)
-        return {"loss": F.smooth_l1_loss(predicted, target, beta=_HUBER_BETA)}
+        pose = F.smooth_l1_loss(predicted, target, beta=_HUBER_BETA)
+        few = max(1, len(tcp) // _FINDER_ROWS)
+        scores = self.estimator.scores({k: p[:few] for k, p in pictures.items()}, words[:few])
+        shares = self.estimator.place_shares({k: p[:few] for k, p in places.items()})
+        find = sum(_find_loss(scores[key], shares[key], told[:few]) for key in scores)
+        return {"loss": pose + find, "pose": pose, "find": find}
+
+
+def _find_loss(
+    scores: Float[Tensor, "b 2 y x"], shares: Float[Tensor, "b 2 y x"], told: Bool[Tensor, " b"]
+) -> Float[Tensor, ""]:
+    """Return the cross-entropy of the goal, and of objects that are alone or told apart."""
+    entropy = -(scores.flatten(2).log_softmax(2) * shares.flatten(2)).sum(2)
+    return (entropy[:, 0] * told).mean() + entropy[:, 1].mean()
+
+
+def _words(
+    placements: Placements,
+    embedded: Float[Tensor, "n d"],
+    rows: Int64[Tensor, " b"],
+    target: Int64[Tensor, " b"],
+    noise: BatchNoise,
+) -> tuple[Float[Tensor, "b d"], Bool[Tensor, " b"]]:
+    """Return the embedded sentences of the targets, and whether each is alone or told apart.
+
+    Half of those that are alone get none.
+    """
+    said, alone = placements.sentence[rows, target], placements.objects[rows] == 1
+    silent = (said < 0) | (alone & (noise.rand((len(rows),)) < 0.5))
+    jitter = _WORD_NOISE * noise.randn((len(rows), WORDS_WIDTH))
+    words = torch.zeros(len(rows), WORDS_WIDTH)
+    words[~silent] = embedded[said[~silent]] + jitter[~silent]
+    return words, alone | (said >= 0)
+
+
+def _places(
+    placements: Placements, rows: Int64[Tensor, " b"], target: Int64[Tensor, " b"]
+) -> dict[str, Float[Tensor, "b 2 2"]]:
+    """Return where the target and the goal are in each camera image, px."""
+    return {
+        key: torch.stack([pixels[rows, target], pixels[rows, -1]], 1)
+        for key, pixels in placements.pixels.items()
+    }
 
 
 def _add_pixel_noise(
@@ -85,21 +156,70 @@ def _add_pixel_noise(
 
 
 @torch.no_grad()
-def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, list[float]]:
-    """Return median and 90th percentile of the errors.
+def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, dict[str, Any]]:
+    """Return the errors by number of other objects; alone, nothing is said.
 
-    Errors of the object's and the goal's position on the table (mm), of the object's height (mm),
-    and of the grasp's yaw (degrees) for objects that are not round.
+    `found` is the share of the objects found within 3 cm. The others are median and 90th
+    percentile: of the object's and the goal's position on the table (mm), of the object's height
+    (mm), and of the grasp's yaw (degrees) for objects that are not round.
     """
-    predicted, true = estimator(placements.pictures, placements.tcp), placements.start
+    errors = {}
+    for others in range(placements.start.shape[1]):
+        named = placements.sentence >= 0
+        if others == 0:
+            named = torch.arange(named.shape[1]) == torch.zeros(len(named), 1)
+        rows = ((placements.objects == others + 1) & named.any(1)).nonzero()[:, 0]
+        if len(rows):
+            target = named[rows].int().argmax(1)
+            words = torch.zeros(len(rows), WORDS_WIDTH)
+            if others:
+                said = placements.sentence[rows, target]
+                words = embed([placements.sentences[i] for i in said])
+            errors[f"{others} others"] = _errors(estimator, placements, rows, target, words)
+    return errors
+
+
+def _errors(
+    estimator: PoseEstimator,
+    placements: Placements,
+    rows: Int64[Tensor, " n"],
+    target: Int64[Tensor, " n"],
+    words: Float[Tensor, "n d"],
+) -> dict[str, Any]:
+    predicted = torch.cat(
+        [
+            estimator(
+                {key: pictures[some] for key, pictures in placements.pictures.items()},
+                placements.tcp[some],
+                said,
+            )
+            for some, said in zip(rows.split(_BATCH), words.split(_BATCH), strict=True)
+        ]
+    )
+    true = placements.start[rows, target]
     off = predicted - true
     twice = torch.atan2(predicted[:, 4], predicted[:, 3]) - torch.atan2(true[:, 4], true[:, 3])
     yaw = torch.rad2deg(torch.atan2(twice.sin(), twice.cos()) / 2).abs()
+    away = 1e3 * off[:, :2].norm(dim=1)
     errors = {
-        "object_mm": 1e3 * off[:, :2].norm(dim=1),
+        "object_mm": away,
         "goal_mm": 1e3 * off[:, 5:].norm(dim=1),
         "height_mm": 1e3 * off[:, 2].abs(),
         "yaw_degrees": yaw[true[:, 4] != 0],  # round objects are grasped at 0 exactly
     }
     at = torch.tensor([0.5, 0.9])
-    return {name: error.quantile(at).tolist() for name, error in errors.items() if len(error)}
+    found = {"count": len(rows), "found": (away < 30).float().mean().item()}
+    return found | {
+        name: error.quantile(at).tolist() for name, error in errors.items() if len(error)
+    }
+
+
+def error_table(errors: dict[str, dict[str, Any]]) -> str:
+    """Return a line for each number of other objects: medians, and 90th percentiles in brackets."""
+    names = ("object_mm", "goal_mm", "height_mm", "yaw_degrees")
+    lines = [f"{'':<10}{'found':>7}" + "".join(f"{n.replace('_', ', '):>16}" for n in names)]
+    for what, row in errors.items():
+        cells = [row.get(name) for name in names]
+        shown = [f"{c[0]:.1f} ({c[1]:.1f})" if c else "-" for c in cells]
+        lines.append(f"{what:<10}{row['found']:>7.2f}" + "".join(f"{s:>16}" for s in shown))
+    return "\n".join(lines)
