@@ -35,6 +35,9 @@ class Config:
     """Policy in place of the cell file's: expert, follower, shipped, a folder that train-policy made, a
     class of your own as module:Class or file.py:Class, whose code then runs, or an openpi server as
     ws://host:port."""
+    target: str | None = None
+    """Object to pick up where several lie on the table, in words, such as "the red block"; in place
+    of the cell file's."""
     execute: bool = False
     """Move the arm. Without it this is a dry run."""
     yes: bool = False
@@ -57,7 +60,7 @@ def main(config: Config) -> None:
     from touchgoal.runtime.run_folder import open_run
 
     file = find_cell_file(config.cell)
-    cell = read_cell_file(file, config.policy, config.sim, config.seed, config.task)
+    cell = read_cell_file(file, config.policy, config.sim, config.seed, config.task, config.target)
     policy = load_policy(cell)
     cost = None
     if cell.task.rewards:
@@ -84,10 +87,11 @@ def load_policy(cell: "CellConfig") -> "DeployedPolicy | None":
 
     if not cell.task.policy:
         raise UserError("task.policy is missing: name one in the cell file, or by --policy")
-    if cell.task.policy in SCRIPTED:
-        return None
     options = env_config_of(cell)
-    if (policy := load_user_policy(cell, options)) is not None:
+    policy = None if cell.task.policy in SCRIPTED else load_user_policy(cell, options)
+    if policy is not None or cell.task.policy in SCRIPTED:
+        if cell.task.target is not None:
+            raise UserError(f"the policy {cell.task.policy} takes no target: leave it out")
         return policy
     from touchgoal.policies.by_name import load_saved_policy
 

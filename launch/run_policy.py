@@ -20,6 +20,9 @@ class Config:
     """Policy: shipped; a folder that train-policy made; expert, which sees the simulator's state;
     follower (bead-maze), classical control from the force on the hand; a class of your own, as
     module:Class or file.py:Class, or an openpi server, as ws://host:port (docs/own_policy.md)."""
+    target: str | None = None
+    """Object to pick up where --env.distractors lie beside it, in words, such as "the red block";
+    {object} in it is the name of each episode's object."""
     out: Path | None = None
     """Folder of the run."""
     episodes: Count = 20
@@ -39,11 +42,12 @@ class Config:
 def main(config: Config) -> None:
     """Run the episodes, print the table, film three of them."""
     from touchgoal.policies.by_name import prepare_policy
+    from touchgoal.policies.checkpoint import EPISODE_OBJECT
     from touchgoal.policies.evaluation.evaluate import run_trials, trial_specs
     from touchgoal.policies.evaluation.report import film_trials, record_trials
     from touchgoal.runtime.run_folder import open_run
 
-    policy, env = prepare_policy(config.policy, config.env)
+    policy, env = prepare_policy(config.policy, config.env, config.target)
     specs = trial_specs(env, config.episodes, config.seed)
     out = open_run(config.out, "run-policy", replace(config, env=env))
     trials = run_trials(env, policy, specs, config.ray or config.workers)
@@ -52,4 +56,6 @@ def main(config: Config) -> None:
         film_trials(out, env, specs, trials, policy, config.workers)
     cell = "sim" if config.task == "pick-place" else "sim_maze"
     command = f"touchgoal deploy {cell} --execute --policy {shlex.quote(config.policy)}"
+    if config.target and EPISODE_OBJECT not in config.target:
+        command += f" --target {shlex.quote(config.target)}"
     print(f"next, in the control loop of a real arm: {command}")

@@ -205,6 +205,11 @@ class LearnedPolicy:
         return replace(task, tactile=reads_touch, cameras=cameras, camera_size=size)
 
     @property
+    def target(self) -> str:
+        """The object to pick up, in words; "" if it is the only one."""
+        return self._learned_estimator.target if self._learned_estimator else ""
+
+    @property
     def _learned_estimator(self) -> StateEstimator | None:
         """The estimator unless the simulator's ground truth stands in its place."""
         return self._estimator if isinstance(self._estimator, StateEstimator) else None

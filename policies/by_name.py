@@ -3,6 +3,7 @@
 For the last two see `control/deployment/user_policy.py`.
 """
 
+import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -15,11 +16,18 @@ from touchgoal.control.deployment.user_policy import Policy, UserPolicy, find_us
 from touchgoal.control.policy_server.policy import PolicyServer
 from touchgoal.episodes.recording import Actor
 from touchgoal.policies.acting import LearnedPolicy
-from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy, suggestion
+from touchgoal.policies.checkpoint import (
+    EPISODE_OBJECT,
+    SHIPPED_POLICIES,
+    SavedPolicy,
+    find_policy,
+    suggestion,
+    with_target,
+)
 from touchgoal.policies.config import POLICIES
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import TaskConfig, TaskName
+from touchgoal.sim_envs.config import PickPlaceConfig, TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import make_expert, task_name
 
 PolicyMaker = Callable[[Any], Actor]
@@ -33,13 +41,22 @@ def scripted(task: TaskName) -> str:
     return "follower" if task == "bead-maze" else "expert"
 
 
-def prepare_policy(policy: AnyPolicy, task: TaskConfig) -> tuple[PolicyMaker, TaskConfig]:
+def prepare_policy(
+    policy: AnyPolicy, task: TaskConfig, target: str | None = None
+) -> tuple[PolicyMaker, TaskConfig]:
     """Return the maker of a policy, and the task's options with the images that it reads.
 
-    UserError: no such policy, it cannot act in the task, or an option of the task is set to
-    something else than the policy needs.
+    `target` is the object in words, see `SavedPolicy`.
+
+    UserError: no such policy, it cannot act in the task, an option of the task is set to
+    something else than the policy needs, or it takes no target.
     """
     maker = choose_policy(policy, task)
+    if isinstance(maker, SavedPolicy):
+        maker = with_target(maker, target)
+        _warn_without_target(maker, task)
+    elif target is not None:
+        raise UserError(f"the policy {policy} takes no target: leave it out")
     needed = env_config_for(maker, task)
     default = type(task)()
     for name in (field.name for field in fields(task)):
@@ -51,6 +68,15 @@ def prepare_policy(policy: AnyPolicy, task: TaskConfig) -> tuple[PolicyMaker, Ta
                 f"{_option(name, given)}: the policy {policy} {instead}; leave the option out"
             )
     return maker, needed
+
+
+def _warn_without_target(policy: SavedPolicy, task: TaskConfig) -> None:
+    if isinstance(task, PickPlaceConfig) and task.distractors and not policy.target:
+        print(
+            f"warning: nothing says which of {1 + task.distractors} objects is meant: add --target "
+            f'"the red block", or "the {EPISODE_OBJECT}" for the name of each episode\'s object',
+            file=sys.stderr,
+        )
 
 
 def _option(name: str, value: object) -> str:
@@ -68,7 +94,7 @@ def choose_policy(policy: AnyPolicy, task: TaskConfig) -> PolicyMaker:
     UserError: no such policy.
     """
     if isinstance(policy, LearnedPolicy) and policy.directory is not None:
-        return SavedPolicy(policy.directory, policy.plan_ticks)
+        return SavedPolicy(policy.directory, policy.plan_ticks, policy.target)
     if not isinstance(policy, str | Path):
         kind = policy if isinstance(policy, type) else type(policy)
         return UserPolicy(kind.__name__, policy)
@@ -115,5 +141,8 @@ def load_saved_policy(cell: CellConfig, task: TaskConfig) -> DeployedPolicy:
     """Return the policy on disk that the cell names; UserError if it does not fit."""
     shipped = cell.task.policy == "shipped"
     directory = SHIPPED_POLICIES[cell.task.simulated] if shipped else find_policy(cell.task.policy)
-    policy = SavedPolicy(directory)()
+    target = cell.task.target
+    if target is not None and EPISODE_OBJECT in target:
+        raise UserError(f"{EPISODE_OBJECT} is known in run-policy alone: name the object itself")
+    policy = with_target(SavedPolicy(directory), target)()
     return DeployedPolicy.for_cell(cell, policy, policy.env_config(task, cell.task.name))

@@ -1,6 +1,6 @@
 """Policies on disk."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
@@ -25,8 +25,10 @@ from touchgoal.policies.perception.state_estimation import (
 )
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
+from touchgoal.sim_envs.pick_place import PickPlace
 
 TOUCH, ESTIMATOR = "touch", "estimator"  # folders beside a policy's weights
+EPISODE_OBJECT = "{object}"  # in a target: the object that the simulated episode asks for
 _WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED_POLICIES = {"pick-place": _WEIGHTS / "pick_place", "bead-maze": _WEIGHTS / "bead_maze"}
 """The shipped policies: each is named after its task."""
@@ -64,21 +66,32 @@ class SavedPolicy:
         directory: of the policy, with its touch encoder in `touch/`, its pose estimator in
             `estimator/`.
         plan_ticks: control ticks by which its plans come late, see `LearnedPolicy`.
+        target: the object to pick up, in words, with `EPISODE_OBJECT` for the name of that which the
+            simulated episode asks for; "" if it is the only one.
     """
 
     directory: Path
     plan_ticks: int = 0
+    target: str = ""
 
     def __call__(self, env: FrankaTactileEnv | None = None) -> LearnedPolicy:
         """Return the policy at an episode's beginning; its plans come as late as `env` says."""
         network, touch, pose_estimator = _load_parts(self.directory, _stamp(self.directory))
-        estimator = StateEstimator(pose_estimator) if pose_estimator else None
+        target = self.target
+        if isinstance(env, PickPlace):
+            target = target.replace(EPISODE_OBJECT, env.asked_name)
+        estimator = StateEstimator(pose_estimator, target) if pose_estimator else None
         plan_ticks = max(self.plan_ticks, env.plan_ticks if env else 0)
         return LearnedPolicy(network, touch, estimator, plan_ticks, self.directory)
 
     def env_config(self, task: Task) -> Task:
         """Return the task's options with the images that the policy reads, see `LearnedPolicy`."""
         return self().env_config(task)
+
+    @property
+    def reads_words(self) -> bool:
+        """Whether it can be told which object to pick up."""
+        return bool(self.network().config.estimated)
 
     def network(self) -> PolicyNetwork:
         """Return the network alone."""
@@ -111,17 +124,29 @@ def _load_parts(
     return network, touch, pose_estimator
 
 
-def load_policy(name_or_path: str | Path) -> LearnedPolicy:
+def load_policy(name_or_path: str | Path, target: str | None = None) -> LearnedPolicy:
     """Load a policy to act with.
 
     Args:
         name_or_path: name of a shipped policy ("pick-place", "bead-maze", "bead-maze-wrench"),
             or a folder that train-policy made.
+        target: the object to pick up where several lie on the table, in words.
 
     Raises:
-        UserError: no such policy, or it is damaged.
+        UserError: no such policy, or it is damaged, or it cannot be told a target.
     """
-    return SavedPolicy(find_policy(name_or_path))()
+    return with_target(SavedPolicy(find_policy(name_or_path)), target)()
+
+
+def with_target(policy: SavedPolicy, target: str | None) -> SavedPolicy:
+    """Return the policy with a target; UserError if that is empty, or the policy takes none."""
+    if target is None:
+        return policy
+    if not target.strip():
+        raise UserError('the target is empty: name the object in words, such as "the red block"')
+    if not policy.reads_words:
+        raise UserError(f"the policy in {policy.directory} takes no target: leave it out")
+    return replace(policy, target=target)
 
 
 def find_policy(name_or_path: str | Path) -> Path:

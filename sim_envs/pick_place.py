@@ -39,8 +39,12 @@ class PickPlace(FrankaTactileEnv):
 
     def instruction(self) -> str:
         """Return the episode's task in words."""
-        name = Path(self.asked).stem.replace("_", " ")  # of an object of one's own: its mesh file
-        return f"pick up the {name} and place it on the disc"
+        return f"pick up the {self.asked_name} and place it on the disc"
+
+    @property
+    def asked_name(self) -> str:
+        """The object to place, in words; one's own is named after its mesh file."""
+        return Path(self.asked).stem.replace("_", " ")
 
     def episode_info(self) -> dict[str, Any]:
         """Return what distinguishes this episode: the object, how it is gripped, what was asked."""

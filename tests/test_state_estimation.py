@@ -14,18 +14,23 @@ from touchgoal.episodes.recording import CORRECTED, EpisodeSpec, record_episode
 from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig
-from touchgoal.policies.perception.placements import Placements
+from touchgoal.policies.perception.placements import Placements, render_placements
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
 from touchgoal.policies.perception.pose_training import pose_errors, train_pose_estimator
 from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.perception.state_estimation import ESTIMATED, StateEstimator
+from touchgoal.policies.perception.target_words import Look, embed, sentence
 from touchgoal.policies.training.dagger import DaggerRoles
+from touchgoal.runtime import seeds
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace
+from touchgoal.sim_envs.scene.objects import CATALOGUE
 
-CROPS = ((ft.FRONT, (0, 16, 0, 16)),)
-SMALL = PoseEstimatorConfig((16, 16), CROPS, channels=8, keypoints=4, keypoint_features=4, width=16)
+CROPS = ((ft.FRONT, (0, 32, 0, 32)),)
+SMALL = PoseEstimatorConfig(
+    (32, 32), CROPS, 8, look=16, channels=8, keypoints=4, keypoint_features=4, width=16
+)
 
 
 def toy_estimator() -> StateEstimator:
@@ -49,25 +54,32 @@ def test_the_start_is_seen_from_the_hand() -> None:
         np.testing.assert_allclose(observed, expected, atol=1e-6)
 
 
-def train_pose(count: int, epochs: int, out: Path) -> float:
-    """Train the pose estimator on bright spots on grey; return the median error, mm."""
-    spots = torch.randint(0, 14, (count, 2), generator=torch_rng())
-    pictures = torch.full((count, 16, 16, 3), 128, dtype=torch.uint8)
-    for picture, (row, column) in zip(pictures, spots, strict=True):
-        picture[row : row + 2, column : column + 2] = 255
-    start = torch.zeros(count, 7)
-    start[:, 3] = 1.0
-    start[:, :2] = spots / 100
+SPOTS = {"red": (255, 0, 0), "blue": (0, 0, 255)}  # the objects; the goal is green
+
+
+def spots(count: int) -> Placements:
+    """Draw a red and a blue spot, of which the second is left out at times, and a green goal."""
+    places = torch.stack([torch.randperm(25, generator=torch_rng(i))[:3] for i in range(count)])
+    places = torch.stack([places // 5, places % 5], 2) * 6 + 4
+    objects = 1 + torch.arange(count) % 2
+    pictures = torch.full((count, 32, 32, 3), 128, dtype=torch.uint8)
+    for picture, place, n in zip(pictures, places, objects, strict=True):
+        colours = [*list(SPOTS.values())[:n], (0, 255, 0)]
+        for colour, (row, column) in zip(colours, [*place[:n], place[2]], strict=True):
+            picture[row - 1 : row + 2, column - 1 : column + 2] = torch.tensor(colour)
+    start = torch.zeros(count, 2, 7)
+    start[..., 3] = 1.0
+    start[..., :2], start[..., 5:] = places[:, :2] / 100, places[:, 2:] / 100
     tcp = torch.randn(count, 7, generator=torch_rng())
-    placements = Placements({ft.FRONT: pictures}, tcp, start)
-    sight = PoseEstimator(SMALL)
-    config = PoseTrainConfig(epochs=epochs, lr=1e-2)
-    train_pose_estimator(sight, placements, config, out, TrainerOptions(), {})
-    return pose_errors(sight, placements)["object_mm"][0]
+    sentence = torch.tensor([[0, 1]]).repeat(count, 1)
+    sentence[objects == 1, 1] = -1
+    pixels = {ft.FRONT: places.float()}
+    named = tuple(f"the {colour} spot" for colour in SPOTS)
+    return Placements({ft.FRONT: pictures}, tcp, start, pixels, objects, sentence, named)
 
 
 def test_contact_is_the_simulators_in_every_tick() -> None:
-    env = PickPlace(PickPlaceConfig(camera_size=(16, 16), cameras=("front",)))
+    env = PickPlace(PickPlaceConfig(camera_size=(32, 32), cameras=("front",)))
     episode = record_episode(env, EpisodeSpec(4, options={"object": "wooden_block"}))
     frames, estimator = episode.frames, toy_estimator()
     ticks = [{k: v[i] for k, v in frames.items()} for i in range(len(frames[ft.ACTION]))]
@@ -79,9 +91,44 @@ def test_contact_is_the_simulators_in_every_tick() -> None:
     assert not estimator.estimate(again, again)[ft.TRUTH_CONTACT].any()
 
 
-def test_a_place_is_learnt(tmp_path: Path) -> None:
+def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    assert train_pose(256, 75, tmp_path) < 15  # 60 by chance
+    placements, sight = spots(256), PoseEstimator(SMALL)
+    config = PoseTrainConfig(epochs=60, lr=1e-2)
+    train_pose_estimator(sight, placements, config, tmp_path, TrainerOptions(), {})
+    errors = pose_errors(sight, placements)
+    assert errors["0 others"]["object_mm"][0] < 15 and errors["1 others"]["found"] > 0.9
+    rows = placements.objects == 2
+    pictures = {ft.FRONT: placements.pictures[ft.FRONT][rows]}
+    tcp = placements.tcp[rows]
+    for k, said in enumerate(("a red dot", "a blue dot")):
+        words = embed([said]).expand(len(tcp), -1)
+        off = sight(pictures, tcp, words)[:, :2] - placements.start[rows, k, :2]
+        assert off.norm(dim=1).median() < 0.02  # 0.12 by chance
+
+
+def test_a_sentence_fits_its_object_alone() -> None:
+    rng = np.random.default_rng(0)
+    looks = [
+        Look(CATALOGUE[name], CATALOGUE[name].material.rgba[:3], painted=False)
+        for name in ("toy_brick", "brick", "golf_ball")
+    ]
+    said = [{sentence(rng, a, [b for b in looks if b is not a]) for _ in range(60)} for a in looks]
+    assert not said[0] & said[1] and not said[0] & said[2]
+    assert "the toy brick" in said[0] and "a white ball" in said[2]
+    assert all("block" not in words or "red" in words for words in said[1] if words)
+    assert sentence(rng, looks[0], [looks[0]]) is None
+
+
+def test_placements_say_where_each_object_is() -> None:
+    config = PickPlaceConfig(cameras=("front",), camera_size=(256, 256), tactile=False)
+    placements = render_placements(config, 1, 12, seeds.POSE_VALIDATION.start, 1)
+    assert len(placements) == 12 and placements.objects.unique().tolist()[-1] > 1
+    for i, n in enumerate(placements.objects):
+        assert (placements.sentence[i, n:] == -1).all()
+        row, column = placements.pixels[ft.FRONT][i, -1].round().long()
+        red, green, blue = placements.pictures[ft.FRONT][i, row, column].tolist()
+        assert green > red and green > blue  # the disc
 
 
 SEES = (ft.STATE, ft.TCP_POSE, *ESTIMATED)

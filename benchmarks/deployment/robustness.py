@@ -11,6 +11,7 @@ from touchgoal.benchmarks.deployment.trials import UNCHANGED, DeployedOptions, t
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.sim_envs.config import TaskConfig, TaskName
+from touchgoal.sim_envs.scene.objects import NEW_KINDS
 from touchgoal.sim_envs.scene.wires import HELD_OUT
 
 _LIGHT = {
@@ -24,8 +25,9 @@ _FROZEN = {"every second picture frozen": {"picture_rate": 10.0}}
 _CHANGES: dict[TaskName, dict[str, dict[str, Any]]] = {
     "pick-place": {
         **_LIGHT,
-        "1 other object": {"distractors": 1},
-        "2 other objects": {"distractors": 2},
+        "1 other object, target named": {"distractors": 1},
+        "2 other objects, target named": {"distractors": 2},
+        "kinds never trained on": {"objects": tuple(NEW_KINDS)},
         "mass x2": {"mass": (0.04, 0.4)},
     },
     "bead-maze": {

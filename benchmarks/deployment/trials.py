@@ -8,10 +8,18 @@ from typing import Any
 import numpy as np
 
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from touchgoal.policies.by_name import choose_policy
+from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy
 from touchgoal.policies.evaluation.evaluate import Evaluation, evaluate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
-from touchgoal.sim_envs.config import ENVS, BeadMazeConfig, TaskConfig, TaskName
+from touchgoal.sim_envs.config import (
+    ENVS,
+    BeadMazeConfig,
+    PickPlaceConfig,
+    TaskConfig,
+    TaskName,
+)
 
 UNCHANGED = "unchanged"  # row of a table
 TABLE_HEAD = f"{'':<46}{'success [95 % Wilson]':<24}{'peak force N, mean':>19}{'sd':>6}{'max':>6}"
@@ -53,12 +61,24 @@ def try_cases(config: TrialOptions, cases: Iterable[tuple[str, TaskConfig]]) -> 
     lines, rows = [TABLE_HEAD], []
     for what, task in cases:
         result = evaluate(
-            config.policy, task, episodes=config.episodes, seed=config.seed, workers=config.workers
+            config.policy,
+            task,
+            episodes=config.episodes,
+            seed=config.seed,
+            workers=config.workers,
+            target=_target(config.policy, task),
         )
         lines.append(table_row(what, result))
         print(lines[-1], file=sys.stderr, flush=True)
         rows.append({"what": what, "trials": [asdict(trial) for trial in result.trials]})
     return {"table": "\n".join(lines), "rows": rows}
+
+
+def _target(policy: str, task: TaskConfig) -> str | None:
+    """Return a sentence with the object's name where others lie beside it; experts need none."""
+    maker, beside = choose_policy(policy, task), isinstance(task, PickPlaceConfig)
+    named = beside and task.distractors and isinstance(maker, SavedPolicy) and maker.reads_words
+    return f"the {EPISODE_OBJECT}" if named else None
 
 
 def table_row(what: str, result: Evaluation) -> str:

@@ -30,11 +30,17 @@ def find_cell_file(path: Path) -> Path:
 
 
 def read_cell_file(
-    path: Path, policy: str = "", sim: bool = False, seed: int | None = None, task: str = ""
+    path: Path,
+    policy: str = "",
+    sim: bool = False,
+    seed: int | None = None,
+    task: str = "",
+    target: str | None = None,
 ) -> CellConfig:
     """Read a cell file: TOML, or the `cell.json` that a twin has written.
 
-    `policy`, `seed` and `task` (its name) replace the file's, `sim` its arm by a simulated one.
+    `policy`, `seed`, `task` (its name) and `target` replace the file's, `sim` its arm by a simulated
+    one.
     UserError as `read_config`, and if the sections do not fit together.
     """
     cell = read_config(path, CellConfig, "cell file")
@@ -44,6 +50,8 @@ def read_cell_file(
         if task and task != cell.task.name:
             renamed = replace(cell.task, name=task, scene=cell.task.simulated, instruction="")
             cell = replace(cell, task=renamed)
+        if target is not None:
+            cell = replace(cell, task=replace(cell.task, target=target))
         check(cell)
         if sim:
             cell = replace(cell, arm="sim")

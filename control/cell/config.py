@@ -128,6 +128,8 @@ class TaskSection:
     train-policy made, a class of your own (file.py:Class), whose code then runs, or ws://host:port."""
     instruction: str = ""
     """Instruction in words, for the record; default: the name."""
+    target: str | None = None
+    """Object that a learned policy picks up where several lie on the table, in words."""
     seconds: Annotated[float, Field(gt=0, le=3600)] = 30.0
     """Time limit of the run, s."""
     start: tuple[Angle, ...] | None = None

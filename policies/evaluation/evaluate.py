@@ -87,6 +87,7 @@ def evaluate(
     episodes: int = 20,
     seed: int = seeds.EVALUATION.start,
     workers: int = 1,
+    target: str | None = None,
 ) -> Evaluation:
     """Run a policy in a task and return how often it succeeds.
 
@@ -98,13 +99,15 @@ def evaluate(
         seed: of the first episode; each further one adds one.
         workers: processes that simulate; with more than one, start from a script that guards its
             main part by `if __name__ == "__main__"`.
+        target: the object to pick up where several lie on the table, in words; "{object}" in it is
+            the name of each episode's.
 
     Raises:
         UserError: no such task or policy, or the policy cannot act in the task.
     """
     if episodes < 1 or workers < 1:
         raise UserError("evaluate needs at least one episode and one worker")
-    maker, config = prepare_policy(policy, _task_config(task))
+    maker, config = prepare_policy(policy, _task_config(task), target)
     return Evaluation(
         tuple(run_trials(config, maker, trial_specs(config, episodes, seed), workers))
     )

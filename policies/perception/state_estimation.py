@@ -18,6 +18,7 @@ from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.config import PoseEstimatorConfig
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
+from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
 from touchgoal.runtime.errors import UserError
 
 ESTIMATOR_FORMAT = WeightsFormat(
@@ -32,11 +33,12 @@ class StateEstimator:
     Attributes:
         cameras: columns of the camera images that it reads.
         camera_size: rows and columns of these.
+        target: the object in words; "" if it is the only one.
     """
 
-    def __init__(self, pose_estimator: PoseEstimator) -> None:
+    def __init__(self, pose_estimator: PoseEstimator, target: str = "") -> None:
         """Use a network for inference."""
-        self.pose_estimator = pose_estimator
+        self.pose_estimator, self.target = pose_estimator, target
         self.camera_size = pose_estimator.config.size
         self.cameras = tuple(key for key, _ in pose_estimator.config.crops)
         self._first: Mapping[str, np.ndarray] | None = None
@@ -61,7 +63,8 @@ class StateEstimator:
         """Begin an episode: estimate its poses, take its untouched gels."""
         pictures = {key: self._picture(key, first[key]) for key in self.cameras}
         tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
-        self._start = self.pose_estimator(pictures, tcp)[0].numpy()
+        words = embed([self.target]) if self.target else torch.zeros(1, WORDS_WIDTH)
+        self._start = self.pose_estimator(pictures, tcp, words)[0].numpy()
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
         self._first = first
 

@@ -9,11 +9,12 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from touchgoal.encoders.towers.minilm import WIDTH as WORDS_WIDTH
 from touchgoal.encoders.towers.towers import OfflineTowers
 from touchgoal.sim_envs.scene.objects import ObjectKind
 
 RGB = tuple[float, float, float]
+WORDS_WIDTH = OfflineTowers.text_dim
+"""Width of a sentence's embedding."""
 
 COLOURS: dict[str, RGB] = {
     "red": (0.75, 0.15, 0.12), "dark red": (0.5, 0.1, 0.1), "orange": (0.95, 0.55, 0.2),
@@ -89,7 +90,7 @@ def _distance(one: RGB, other: RGB) -> float:
     return float(np.linalg.norm(np.subtract(one, other)))
 
 
-def embed(sentences: Sequence[str]) -> Float[Tensor, "n {WORDS_WIDTH}"]:
+def embed(sentences: Sequence[str]) -> Float[Tensor, "n d"]:
     """Return the frozen offline tower's embeddings, of length 1; UserError: its wheel is missing."""
     return F.normalize(_towers().embed_texts(list(sentences)), dim=1)
 
