@@ -9,7 +9,7 @@ CODE := runtime control sim_envs episodes encoders rewards policies benchmarks l
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy maze-wrench-policy pick-place-policy clean
+.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy maze-wrench-policy pick-place-policy pose-estimator clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -103,6 +103,10 @@ weights-markers: $(READY)
 # How a shipped policy is made anew, by one command each that says what it did (recipe.json beside the
 # weights). The maze's baseline learns the touch encoder that both read. (What ships of pick-and-place had
 # other rounds, see docs/training.md.)
+pose-estimator: $(READY)
+	$(BIN)/touchgoal train-pose-estimator --out runs/pose
+	cp runs/pose/estimator/* policies/weights/pick_place/estimator/
+
 pick-place-policy: $(READY)
 	$(BIN)/touchgoal make-policy --out runs/pick_place
 	rm -rf policies/weights/pick_place && cp -r runs/pick_place/policy/policy policies/weights/pick_place

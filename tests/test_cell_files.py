@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import pytest
 from fake_cell import SIM, write_cell_file
@@ -21,6 +22,7 @@ from touchgoal.control.safety.limits import FR3
 from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.launch.deploy import load_policy
+from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig
 
@@ -36,6 +38,18 @@ def test_example_cell_files_are_read(path: Path) -> None:
         low, high = BeadMazeConfig().grasp_force
         assert low <= cell.gripper.force <= high
         assert load_policy(cell) is not None
+
+
+def test_a_target_reaches_the_policy_or_is_refused() -> None:
+    for policy, target, message in (
+        ("shipped", "", "the target is empty"),
+        ("shipped", "the {object}", "name the object itself"),
+        ("expert", "a red block", "the policy expert takes no target"),
+    ):
+        with pytest.raises(UserError, match=message):
+            load_policy(read_cell_file(EXAMPLES / "sim.toml", policy, target=target))
+    deployed = load_policy(read_cell_file(EXAMPLES / "sim.toml", "shipped", target="a red block"))
+    assert deployed is not None and cast(LearnedPolicy, deployed.planner).target == "a red block"
 
 
 def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -16,8 +17,9 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.policies import checkpoint
+from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.by_name import prepare_policy
-from touchgoal.policies.checkpoint import load_policy
+from touchgoal.policies.checkpoint import EPISODE_OBJECT, load_policy
 from touchgoal.policies.evaluation import evaluate as evaluation
 from touchgoal.policies.evaluation.evaluate import evaluate, run_trials, trial_specs
 from touchgoal.policies.evaluation.report import film_trials
@@ -112,6 +114,30 @@ def test_an_option_that_the_policy_fixes_is_not_overridden(
 ) -> None:
     with pytest.raises(UserError, match=message):
         prepare_policy(policy, PickPlaceConfig(**options))
+
+
+def test_a_target_is_told_to_what_takes_one(capsys: pytest.CaptureFixture[str]) -> None:
+    blind = PickPlaceConfig(cameras=(), tactile=False)
+    env = make_env(replace(blind, objects=("golf_ball",), distractors=1))
+    env.reset(seed=0)
+    for target, told in (
+        (f"the {EPISODE_OBJECT}", "the golf ball"),
+        ("a red block", "a red block"),
+    ):
+        maker, _ = prepare_policy("shipped", PickPlaceConfig(distractors=1), target)
+        assert cast(LearnedPolicy, maker(env)).target == told and not capsys.readouterr().err
+    policy = load_policy("pick-place", target="a red block")
+    again = prepare_policy(policy, PickPlaceConfig(distractors=1))[0](env)
+    assert cast(LearnedPolicy, again).target == "a red block"
+    prepare_policy("shipped", PickPlaceConfig(distractors=2))
+    assert "nothing says which of 3 objects is meant: add --target" in capsys.readouterr().err
+    for name, task, target, message in (
+        ("shipped", PickPlaceConfig(), " ", "the target is empty: name the object"),
+        ("shipped", BeadMazeConfig(), "a bead", "takes no target"),
+        ("expert", PickPlaceConfig(), "a red block", "the policy expert takes no target"),
+    ):
+        with pytest.raises(UserError, match=message):
+            prepare_policy(name, task, target)
 
 
 class Degrees(Still):

@@ -76,9 +76,11 @@ def try_cases(config: TrialOptions, cases: Iterable[tuple[str, TaskConfig]]) -> 
 
 def _target(policy: str, task: TaskConfig) -> str | None:
     """Return a sentence with the object's name where others lie beside it; experts need none."""
-    maker, beside = choose_policy(policy, task), isinstance(task, PickPlaceConfig)
-    named = beside and task.distractors and isinstance(maker, SavedPolicy) and maker.reads_words
-    return f"the {EPISODE_OBJECT}" if named else None
+    if not isinstance(task, PickPlaceConfig) or not task.distractors:
+        return None
+    maker = choose_policy(policy, task)
+    reads = isinstance(maker, SavedPolicy) and maker.reads_words
+    return f"the {EPISODE_OBJECT}" if reads else None
 
 
 def table_row(what: str, result: Evaluation) -> str:

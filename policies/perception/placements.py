@@ -94,13 +94,13 @@ def _render_placement(env: PickPlace, rng: np.random.Generator, painted: float) 
     shown = [env.bodies[i] for i in order[:count]]
     looks = []
     for body in env.bodies:
-        rgb, paint = body.kind.material.rgba[:3], bool(rng.random() < painted)
+        rgb, paint = np.array(body.kind.material.rgba[:3]), bool(rng.random() < painted)
         if paint:
             name = list(COLOURS)[rng.integers(len(COLOURS))]
             rgb = np.clip(rng.normal(COLOURS[name], _COLOUR_NOISE), 0, 1)
         env.model.geom(body.name).rgba[:] = *rgb, float(body in shown)
         if body in shown:
-            looks.append(Look(body.kind, tuple(map(float, rgb)), paint))
+            looks.append(Look(body.kind, rgb, paint))
     shown.sort(key=env.bodies.index)
     observation, _ = env.rearrange()
     row: dict[str, Any] = dict(observation)

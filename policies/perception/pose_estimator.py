@@ -4,6 +4,8 @@ It looks twice: a coarse map scores where the named object and the goal are; a c
 full resolution, gives their poses.
 """
 
+from typing import cast
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
@@ -51,12 +53,8 @@ class PoseEstimator(nn.Module):
 
         `words` are `target_words.embed`; zeros where nothing is said and one object is there.
         """
-        places = {
-            key: finder.find(scores)
-            for (key, scores), finder in zip(
-                self.scores(pictures, words).items(), self.finders, strict=True
-            )
-        }
+        scores = self.scores(pictures, words)
+        places = {key: _find(scores[key], box) for key, box in self.config.crops}
         return self.start_normalizer.inverse(self.scaled(pictures, tcp, places))
 
     def scores(
@@ -70,10 +68,7 @@ class PoseEstimator(nn.Module):
 
     def place_shares(self, places: Places) -> dict[str, Float[Tensor, "b 2 y x"]]:
         """Return the targets of `scores`: what each cell should hold of a place."""
-        return {
-            key: finder.shares(places[key])
-            for (key, _), finder in zip(self.config.crops, self.finders, strict=True)
-        }
+        return {key: _shares(places[key], box) for key, box in self.config.crops}
 
     def scaled(
         self, pictures: Pictures, tcp: Float[Tensor, "b 7"], places: Places
@@ -83,7 +78,8 @@ class PoseEstimator(nn.Module):
         for part, head in enumerate(self.heads):
             found = [self.tcp_normalizer(tcp)]
             for (key, _), looks in zip(self.config.crops, self.looks, strict=True):
-                found.append(looks[part](pictures[key], places[key][:, part]))
+                look = cast(nn.ModuleList, looks)[part]
+                found.append(look(pictures[key], places[key][:, part]))
             estimate.append(head(torch.cat(found, 1)))
         return torch.cat(estimate, 1)
 
@@ -135,27 +131,28 @@ class _Finder(nn.Module):
         queries = queries + torch.stack([self.words(words), torch.zeros_like(queries[:, 1])], 1)
         return torch.einsum("bqc,bcyx->bqyx", queries, maps)
 
-    def _centres(self, shape: torch.Size) -> Float[Tensor, "y x 2"]:
-        """Return row and column (px) of the centre of each cell of a map."""
-        h, w = shape[-2:]
-        rows = self.box[0] + _FIRST + _CELL * torch.arange(h)
-        columns = self.box[2] + _FIRST + _CELL * torch.arange(w)
-        return torch.stack(torch.meshgrid(rows, columns, indexing="ij"), -1).to(self.queries)
 
-    def shares(self, places: Float[Tensor, "b 2 2"]) -> Float[Tensor, "b 2 y x"]:
-        """Return a share of each cell, by its distance from the place; they sum to 1."""
-        top, bottom, left, right = self.box
-        centres = self._centres(torch.Size([(bottom - top) // _CELL, (right - left) // _CELL]))
-        far = (places[:, :, None, None] - centres).square().sum(-1) / _CELL**2
-        return (-far / 2).flatten(2).softmax(2).view_as(far)
+def _centres(box: Box) -> Float[Tensor, "y x 2"]:
+    """Return row and column (px) of the centre of each cell of a finder's map."""
+    top, bottom, left, right = box
+    rows, columns = torch.arange(top, bottom, _CELL), torch.arange(left, right, _CELL)
+    return _FIRST + torch.stack(torch.meshgrid(rows, columns, indexing="ij"), -1)
 
-    def find(self, scores: Float[Tensor, "b 2 y x"]) -> Float[Tensor, "b 2 2"]:
-        """Return the places (px): the mean over the cells around the highest score."""
-        centres = self._centres(scores.shape).flatten(0, 1)
-        peak = centres[scores.flatten(2).argmax(2)]
-        near = (peak[:, :, None] - centres).norm(dim=-1) <= _PEAK * _CELL
-        share = scores.flatten(2).masked_fill(~near, -torch.inf).softmax(2)
-        return share @ centres
+
+def _shares(places: Float[Tensor, "b 2 2"], box: Box) -> Float[Tensor, "b 2 y x"]:
+    """Return a share of each cell, by its distance from the place; they sum to 1."""
+    centres = _centres(box).to(places)
+    far = (places[:, :, None, None] - centres).square().sum(-1) / _CELL**2
+    return (-far / 2).flatten(2).softmax(2).view_as(far)
+
+
+def _find(scores: Float[Tensor, "b 2 y x"], box: Box) -> Float[Tensor, "b 2 2"]:
+    """Return the places (px): the mean over the cells around the highest score."""
+    centres = _centres(box).to(scores).flatten(0, 1)
+    peak = centres[scores.flatten(2).argmax(2)]
+    near = (peak[:, :, None] - centres).norm(dim=-1) <= _PEAK * _CELL
+    share = scores.flatten(2).masked_fill(~near, -torch.inf).softmax(2)
+    return share @ centres
 
 
 class _SpatialSoftmax(nn.Module):

@@ -98,7 +98,7 @@ class _PoseLoss(nn.Module):
         few = max(1, len(tcp) // _FINDER_ROWS)
         scores = self.estimator.scores({k: p[:few] for k, p in pictures.items()}, words[:few])
         shares = self.estimator.place_shares({k: p[:few] for k, p in places.items()})
-        find = sum(_find_loss(scores[key], shares[key], told[:few]) for key in scores)
+        find = torch.stack([_find_loss(scores[k], shares[k], told[:few]) for k in scores]).sum()
         return {"loss": pose + find, "pose": pose, "find": find}
 
 

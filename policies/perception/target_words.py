@@ -12,7 +12,7 @@ from torch import Tensor
 from touchgoal.encoders.towers.towers import OfflineTowers
 from touchgoal.sim_envs.scene.objects import ObjectKind
 
-RGB = tuple[float, float, float]
+RGB = tuple[float, float, float] | Float[np.ndarray, "3"]
 WORDS_WIDTH = OfflineTowers.text_dim
 """Width of a sentence's embedding."""
 
