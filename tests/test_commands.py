@@ -171,7 +171,7 @@ def test_learning_to_pick_and_place(
     """The commands from placements to a corrected policy, at toy size."""
     monkeypatch.chdir(tmp_path)
     one, blind = ("--workers", 1), ("--env.no-tactile", "--env.cameras", "--out", "demos")
-    run("train-pose-estimator", *one, "--objects", 2, "--placements", 2, "--train.epochs", 1,
+    run("train-pose-estimator", *one, "--scenes", 2, "--placements", 2, "--train.epochs", 1,
         "--out", "est")  # fmt: skip
     record = ("collect-demos", "--feedback", "--episodes", 1, *one)
     run(*record, *blind)
