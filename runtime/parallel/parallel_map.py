@@ -27,8 +27,9 @@ def parallel_map(
     """Compute the function of each item: `with parallel_map(…) as results:`, in the items' order.
 
     Each result comes once. If a worker dies or a node is lost, what it had not handed over is computed
-    again: the function must depend on its item alone. A few items a core are computed ahead of the reader. The workers end with the block. UserError: there is no such cluster, or the
-    workers of an item die again and again.
+    again: the function must depend on its item alone. A few items a core are computed ahead of the
+    reader. The workers end with the block. UserError: there is no such cluster, or the workers of an
+    item die again and again.
 
     Args:
         function: must pickle; on Ray every node needs this version of touchgoal, and what is read.
