@@ -91,11 +91,17 @@ def test_contact_is_the_simulators_in_every_tick() -> None:
     assert not estimator.estimate(again, again)[ft.TRUTH_CONTACT].any()
 
 
-def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
+def train_pose(count: int, epochs: int, out: Path) -> tuple[Placements, PoseEstimator]:
+    """Train a small estimator on bright spots; return the spots, too."""
     torch.manual_seed(0)
-    placements, sight = spots(256), PoseEstimator(SMALL)
-    config = PoseTrainConfig(epochs=60, lr=1e-2)
-    train_pose_estimator(sight, placements, config, tmp_path, TrainerOptions(), {})
+    placements, sight = spots(count), PoseEstimator(SMALL)
+    config = PoseTrainConfig(epochs=epochs, lr=1e-2)
+    train_pose_estimator(sight, placements, config, out, TrainerOptions(), {})
+    return placements, sight
+
+
+def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
+    placements, sight = train_pose(256, 60, tmp_path)
     errors = pose_errors(sight, placements)
     assert errors["0 others"]["object_mm"][0] < 15 and errors["1 others"]["found"] > 0.9
     rows = placements.objects == 2

@@ -158,7 +158,7 @@ class _Stages(nn.Module):
 
     def __init__(self, network: EfficientNetLite0, last_block: int) -> None:
         super().__init__()
-        self.stem, self.blocks = network.stem, network.blocks[: last_block + 1]
+        self.stem, self.blocks = network.stem, nn.ModuleList(list(network.blocks)[: last_block + 1])
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
         return pool_stages(self.stem, self.blocks, images)
