@@ -66,7 +66,7 @@ def _simulate(config: Any) -> None:
     from touchgoal.episodes.bench_recording import record_bench
     from touchgoal.episodes.format.set_files import INFO
     from touchgoal.episodes.store import EpisodeSet
-    from touchgoal.episodes.wand_recording import record_touches
+    from touchgoal.episodes.wand.recording import record_touches
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.interruption import on_interruption
     from touchgoal.runtime.run_folder import open_run
@@ -102,7 +102,7 @@ def _record_real(config: Any) -> None:
     """Record from a real wand until Ctrl-C, or the number of touches is reached."""
     from touchgoal.control.cell.config_file import read_config
     from touchgoal.control.cell.wand import WandConfig
-    from touchgoal.episodes.real_wand_recording import record_real_touches
+    from touchgoal.episodes.wand.real_recording import record_real_touches
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.run_folder import open_run
 

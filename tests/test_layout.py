@@ -80,3 +80,40 @@ def test_the_robots_pc_needs_neither_torch_nor_mujoco() -> None:
 def test_code_cites_published_sources() -> None:
     """Notes that only the authors have are no source for a limit or a constant."""
     assert not [str(p) for p in SOURCES if "shared/" in p.read_text()]
+
+
+def test_no_folder_holds_more_than_twelve_files() -> None:
+    many = {"launch": 99}
+    folders = {path.parent for path in SOURCES}
+    counts = {str(f.relative_to(ROOT)): len(list(f.glob("*.py"))) for f in folders}
+    assert not {f: n for f, n in counts.items() if n > many.get(f, 12)}
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    """As they load: what a function imports when it is called does not count."""
+    files = {"touchgoal." + ".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in SOURCES}
+    imports = {name: imported_on_load(ast.parse(p.read_text()).body) for name, p in files.items()}
+    done: set[str] = set()
+
+    def visit(name: str, above: tuple[str, ...]) -> None:
+        assert name not in above, " -> ".join((*above, name))
+        if name in done:
+            return
+        for other in imports[name]:
+            for module in {other, other.rpartition(".")[0]} & imports.keys():
+                visit(module, (*above, name))
+        done.add(name)
+
+    for name in files:
+        visit(name, ())
+
+
+def imported_on_load(body: list[ast.stmt]) -> set[str]:
+    """Return the modules and names that statements import, but for types alone."""
+    names = set()
+    for node in body:
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.If | ast.Try) and "TYPE_CHECKING" not in ast.dump(node):
+            names |= imported_on_load([*node.body, *node.orelse])
+    return names

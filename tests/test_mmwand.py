@@ -20,7 +20,6 @@ from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.whitening.surface_words import surface_ranks
-from touchgoal.episodes import wand_recording
 from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
     read_objectfolder_real,
     read_touches,
@@ -33,7 +32,8 @@ from touchgoal.episodes.importers.touch_sets.vt60 import (
 )
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.episodes.wand_recording import record_touches
+from touchgoal.episodes.wand import recording as wand_recording
+from touchgoal.episodes.wand.recording import record_touches
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface

@@ -25,8 +25,8 @@ from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.control.wand_touch import FORCE_RANGES, MAX_FORCE, WandTouch
 from touchgoal.encoders.alignment.wand_set import WandSet
-from touchgoal.episodes import wand_recording
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.wand import recording as wand_recording
 from touchgoal.launch.__main__ import main
 from touchgoal.sim_envs.touch_wand import TouchWand
 from touchgoal.sim_envs.twin.mjpeg import Stream, StreamServer

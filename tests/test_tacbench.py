@@ -25,7 +25,7 @@ from touchgoal.benchmarks.papers.tacbench.published_recordings import find_publi
 from touchgoal.benchmarks.papers.tacbench.slip import f1_score, slip_metrics
 from touchgoal.benchmarks.papers.tacbench.task import split_force, split_grasp, split_slip
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
-from touchgoal.control.tactile.markers import MarkerTracker
+from touchgoal.control.tactile.markers.tracker import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, find_sensor
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as MINI
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig

@@ -8,7 +8,7 @@ from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import contact_strength
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.force import estimate_force
-from touchgoal.control.tactile.markers import MarkerTracker, find_markers, without_markers
+from touchgoal.control.tactile.markers.tracker import MarkerTracker, find_markers, without_markers
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, GELSIGHT_MINI, SensorModel
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as DOTTED
 from touchgoal.runtime.errors import UserError

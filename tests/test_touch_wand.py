@@ -17,8 +17,8 @@ from touchgoal.encoders.alignment.green_screen import (
     random_background,
     replace_background,
 )
-from touchgoal.episodes import wand_recording
-from touchgoal.episodes.wand_recording import record_touches
+from touchgoal.episodes.wand import recording as wand_recording
+from touchgoal.episodes.wand.recording import record_touches
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.touch_wand import Touch, TouchWand

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.control.tactile.markers import MarkerTracker
+from touchgoal.control.tactile.markers.tracker import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, MarkerGrid
 from touchgoal.episodes.importers.marker_pictures import (
     MarkerPicture,

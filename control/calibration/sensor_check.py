@@ -15,7 +15,7 @@ from touchgoal.control.tactile.background import Background, Drift, local_change
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.force import estimate_force
-from touchgoal.control.tactile.markers import MarkerTracker, without_markers
+from touchgoal.control.tactile.markers.tracker import MarkerTracker, without_markers
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration, load
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError

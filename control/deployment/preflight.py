@@ -19,7 +19,7 @@ from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.control.sensors.exchanged import fingertips_exchanged
 from touchgoal.control.tactile.contact import contact_strength
 from touchgoal.control.tactile.indentation import require_readable
-from touchgoal.control.tactile.markers import find_markers, without_markers
+from touchgoal.control.tactile.markers.tracker import find_markers, without_markers
 from touchgoal.control.tactile.picture_guard import check_untouched
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor

@@ -13,7 +13,7 @@ import numpy as np
 from touchgoal.control.arrays import Picture
 from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.light_gain import remove_gain
-from touchgoal.control.tactile.markers import find_markers, without_markers
+from touchgoal.control.tactile.markers.tracker import find_markers, without_markers
 from touchgoal.control.tactile.sensor_models import SensorModel
 
 # Strength of a change: counts, and multiple of the picture's median. Between untouched pictures of one

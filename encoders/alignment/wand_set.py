@@ -30,7 +30,7 @@ class WandSet:
     episodes: EpisodeSet  # one touch each
     names: tuple[str, ...]  # objects, sorted
     label: Int[np.ndarray, " n"]  # object of each touch
-    visit: Int[np.ndarray, " n"]  # visit of each touch, see `wand_recording`
+    visit: Int[np.ndarray, " n"]  # visit of each touch, see `episodes.wand.recording`
     sentences: tuple[str, ...]  # sorted
     describes: Bool[np.ndarray, "k m"]  # whether sentence j is on object i
 

@@ -20,7 +20,7 @@ from touchgoal.control.wand_touch import CLIP
 from touchgoal.episodes.format.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.episodes.wand_episode import FPS, SET, Visit, wand_episode
+from touchgoal.episodes.wand.episode import FPS, SET, Visit, wand_episode
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
 from touchgoal.runtime.progress import track

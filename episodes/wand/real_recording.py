@@ -15,7 +15,7 @@ from touchgoal.control.tactile.picture_guard import check_untouched
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.control.wand_touch import FORCE_RANGES, WandTouch, force_range
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.episodes.wand_episode import FPS, SET, Visit, wand_episode
+from touchgoal.episodes.wand.episode import FPS, SET, Visit, wand_episode
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import stop_on_request
 

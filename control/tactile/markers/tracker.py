@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from touchgoal.control.arrays import AnyPicture, Picture
-from touchgoal.control.tactile.marker_matching import Dots, Flags, Spots, average_neighbours, match
+from touchgoal.control.tactile.markers.matching import Dots, Flags, Spots, average_neighbours, match
 from touchgoal.control.tactile.sensor_models import MarkerGrid
 from touchgoal.runtime.errors import UserError
 
@@ -41,7 +41,7 @@ class MarkerTracker:
     """Tracker of one gel's dots: at `rest` in an untouched RGB frame, and `now`, in the last one.
 
     The dots are expected to stay, to keep moving, or else to be back at rest or to have jumped by
-    up to half a spacing, turned and sheared, whichever explains the frame best (`marker_matching`).
+    up to half a spacing, turned and sheared, whichever explains the frame best (`markers.matching`).
     A dot that no spot fits is lost, which is flagged; it is expected where its neighbours'
     displacement carries it. The grid's sizes may be off by a fifth; `pixel_pitch` is m per px.
     UserError if the untouched frame does not show it.
