@@ -45,7 +45,7 @@ SMALLEST_UNIT = {
     "centre": 2e-4,  # m
     "slip": 2e-4,  # m
     "wrench": 1.0,  # N
-    "held": 1 / 3,  # so that a missing fingertip costs 1
+    "held": 1 / 3,  # so that a missing fingertip costs 0.8
 }
 """Least unit of each part, about the noise of a camera: some demonstrations end almost alike. Other
 cameras have the one of `front`."""
