@@ -85,7 +85,19 @@ def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
     assert picture is not None and picture.shape == (1000, 1200, 3)
     report = json.loads((out / "episode_000.json").read_text())
     plain = {"image", "tactile", "text", "image+tactile", "image+text"}
-    parts = {"front", "wrist", "wrist_map", "object", "force", "centre", "held", "words", "value"}
+    parts = {
+        "front",
+        "wrist",
+        "wrist_map",
+        "object",
+        "force",
+        "centre",
+        "held",
+        "slip",
+        "words",
+        "wrench",
+        "value",
+    }
     assert set(report["metrics"]) == {*plain, *parts, "fused"}
     rows = (out / "episode_000.csv").read_text().splitlines()
     assert len(rows) == 1 + EpisodeSet(episodes).lengths[0]
