@@ -17,7 +17,7 @@ class CompiledNetwork:
     """Runs a network that takes one batch of images and returns a tuple of tensors.
 
     A call uses one core; calls from several threads run at the same time, up to the number of cores.
-    The network is compiled anew for each size of images, and must not change afterwards.
+    It is compiled once for each size of images; the network must not change after that.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -28,7 +28,7 @@ class CompiledNetwork:
         self._compiling, self._requests = threading.Lock(), threading.local()
 
     def __reduce__(self) -> tuple[type["CompiledNetwork"], tuple[nn.Module]]:
-        """Copy and pickle the network; the copy compiles it anew."""
+        """Copy and pickle the network alone, which the copy compiles itself."""
         return CompiledNetwork, (self._network,)
 
     def __call__(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:

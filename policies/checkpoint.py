@@ -90,7 +90,7 @@ class SavedPolicy:
 
     @property
     def reads_words(self) -> bool:
-        """Whether it can be told which object to pick up."""
+        """Whether it takes the object to pick up, in words."""
         return bool(self.network().config.estimated)
 
     def network(self) -> PolicyNetwork:
@@ -133,7 +133,7 @@ def load_policy(name_or_path: str | Path, target: str | None = None) -> LearnedP
         target: the object to pick up where several lie on the table, in words.
 
     Raises:
-        UserError: no such policy, or it is damaged, or it cannot be told a target.
+        UserError: no such policy, or it is damaged, or it takes no target.
     """
     return with_target(SavedPolicy(find_policy(name_or_path)), target)()
 

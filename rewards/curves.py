@@ -29,7 +29,8 @@ PLAIN = frozenset({"image", "tactile", "text", *FUSED})
 
 GAMMA = 1.0
 """Default discount per second of the potential-based reward: standing still pays nothing."""
-_SPREAD = 1 / (1 + 1.5**2)  # cost of a part at the spread of successes, see `distance.parts`
+UNITS_AT_HALF = 1.5
+"""Distance, in spreads of successful ends, at which a part costs 0.5; see `distance.parts`."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,7 @@ def main_curve(names: Iterable[str]) -> str:
 def reference_levels(names: Iterable[str], normalised: bool) -> list[tuple[float, str]]:
     """Return reference levels of a cost axis with their labels; none for raw distances."""
     if "fused" in names:
-        return [(0.0, "goal"), (_SPREAD, "spread of successes"), (1.0, "far")]
+        return [(0.0, "goal"), (1 / (1 + UNITS_AT_HALF**2), "spread of successes"), (1.0, "far")]
     return [(0.0, "usual end"), (1.0, "usual start")] if normalised else []
 
 

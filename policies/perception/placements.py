@@ -58,8 +58,8 @@ def render_placements(
     render = partial(_render_scene, config, placements_each, painted)
     with parallel_map(render, seeds, workers) as rendered:
         rows = [row for some in track(rendered, "rendering", "scene", total=scenes) for row in some]
-    said = sorted({words for row in rows for words in row["words"] if words})
-    number = {words: i for i, words in enumerate(said)} | {None: -1}
+    sentences = sorted({words for row in rows for words in row["words"] if words})
+    number = {words: i for i, words in enumerate(sentences)} | {None: -1}
     keys = [key for key in ft.CAMERAS if key in rows[0]]
     return Placements(
         pictures={key: _column(rows, key) for key in keys},
@@ -68,7 +68,7 @@ def render_placements(
         pixels={key: _column(rows, f"pixels.{key}") for key in keys},
         objects=torch.tensor([row["objects"] for row in rows]),
         sentence=torch.tensor([[number[words] for words in row["words"]] for row in rows]),
-        sentences=tuple(said),
+        sentences=tuple(sentences),
     )
 
 

@@ -51,7 +51,7 @@ class PoseEstimator(nn.Module):
     ) -> Float[Tensor, "b 7"]:
         """Return the estimate: m, base frame.
 
-        `words` are `target_words.embed`; zeros where nothing is said and one object is there.
+        `words` are `target_words.embed`; zeros without a sentence, where one object is there.
         """
         scores = self.scores(pictures, words)
         places = {key: _find(scores[key], box) for key, box in self.config.crops}

@@ -41,7 +41,7 @@ def train_pose_estimator(
 
     def batch(rows: Tensor, noise: BatchNoise) -> dict[str, Any]:
         target = (noise.rand((len(rows),)) * placements.objects[rows]).long()
-        words, told = _words(placements, embedded, rows, target, noise)
+        words, unambiguous = _words(placements, embedded, rows, target, noise)
         return {
             "pictures": {
                 key: _add_pixel_noise(
@@ -53,7 +53,7 @@ def train_pose_estimator(
             "start": placements.start[rows, target],
             "places": _places(placements, rows, target),
             "words": words,
-            "told": told,
+            "unambiguous": unambiguous,
             "off": _PLACE_NOISE * (2 * noise.rand((len(rows), 2, 2)) - 1),
         }
 
@@ -88,7 +88,7 @@ class _PoseLoss(nn.Module):
         start: Tensor,
         places: dict[str, Tensor],
         words: Tensor,
-        told: Tensor,
+        unambiguous: Tensor,
         off: Tensor,
     ) -> dict[str, Tensor]:
         near = {key: place + off for key, place in places.items()}
@@ -98,16 +98,20 @@ class _PoseLoss(nn.Module):
         few = slice(None, None, _FINDER_ROWS)  # the same rows in one process and in several
         scores = self.estimator.scores({k: p[few] for k, p in pictures.items()}, words[few])
         shares = self.estimator.place_shares({k: p[few] for k, p in places.items()})
-        find = torch.stack([_find_loss(scores[k], shares[k], told[few]) for k in scores]).sum()
+        find = torch.stack(
+            [_find_loss(scores[k], shares[k], unambiguous[few]) for k in scores]
+        ).sum()
         return {"loss": pose + find, "pose": pose, "find": find}
 
 
 def _find_loss(
-    scores: Float[Tensor, "b 2 y x"], shares: Float[Tensor, "b 2 y x"], told: Bool[Tensor, " b"]
+    scores: Float[Tensor, "b 2 y x"],
+    shares: Float[Tensor, "b 2 y x"],
+    unambiguous: Bool[Tensor, " b"],
 ) -> Float[Tensor, ""]:
-    """Return the cross-entropy of the goal, and of objects that are alone or told apart."""
+    """Return the cross-entropy of the goal, and of unambiguous objects."""
     entropy = -(scores.flatten(2).log_softmax(2) * shares.flatten(2)).sum(2)
-    return (entropy[:, 0] * told).mean() + entropy[:, 1].mean()
+    return (entropy[:, 0] * unambiguous).mean() + entropy[:, 1].mean()
 
 
 def _words(
@@ -117,16 +121,16 @@ def _words(
     target: Int64[Tensor, " b"],
     noise: BatchNoise,
 ) -> tuple[Float[Tensor, "b d"], Bool[Tensor, " b"]]:
-    """Return the embedded sentences of the targets, and whether each is alone or told apart.
+    """Return the embedded sentences of the targets, and whether each is singled out.
 
     Half of those that are alone get none.
     """
-    said, alone = placements.sentence[rows, target], placements.objects[rows] == 1
-    silent = (said < 0) | (alone & (noise.rand((len(rows),)) < 0.5))
+    sentences, alone = placements.sentence[rows, target], placements.objects[rows] == 1
+    silent = (sentences < 0) | (alone & (noise.rand((len(rows),)) < 0.5))
     jitter = _WORD_NOISE * noise.randn((len(rows), WORDS_WIDTH))
     words = torch.zeros(len(rows), WORDS_WIDTH)
-    words[~silent] = embedded[said[~silent]] + jitter[~silent]
-    return words, alone | (said >= 0)
+    words[~silent] = embedded[sentences[~silent]] + jitter[~silent]
+    return words, alone | (sentences >= 0)
 
 
 def _places(
@@ -157,7 +161,7 @@ def _add_pixel_noise(
 
 @torch.no_grad()
 def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, dict[str, Any]]:
-    """Return the errors by number of other objects; alone, nothing is said.
+    """Return the errors by number of other objects; alone, without a sentence.
 
     `found` is the share of the objects found within 3 cm. The others are median and 90th
     percentile: of the object's and the goal's position on the table (mm), of the object's height
@@ -173,8 +177,8 @@ def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, d
             target = named[rows].int().argmax(1)
             words = torch.zeros(len(rows), WORDS_WIDTH)
             if others:
-                said = placements.sentence[rows, target]
-                words = embed([placements.sentences[i] for i in said])
+                sentences = placements.sentence[rows, target]
+                words = embed([placements.sentences[i] for i in sentences])
             errors[f"{others} others"] = _errors(estimator, placements, rows, target, words)
     return errors
 
@@ -191,9 +195,9 @@ def _errors(
             estimator(
                 {key: pictures[some] for key, pictures in placements.pictures.items()},
                 placements.tcp[some],
-                said,
+                chosen,
             )
-            for some, said in zip(rows.split(_BATCH), words.split(_BATCH), strict=True)
+            for some, chosen in zip(rows.split(_BATCH), words.split(_BATCH), strict=True)
         ]
     )
     true = placements.start[rows, target]

@@ -10,7 +10,12 @@ from touchgoal.rewards.distance.embedding_distance import (
     touch_distances,
 )
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, median_name
-from touchgoal.rewards.distance.parts import SMALLEST_UNIT, cosine_distances, part_distances
+from touchgoal.rewards.distance.parts import (
+    SMALLEST_UNIT,
+    SPREAD_QUANTILE,
+    cosine_distances,
+    part_distances,
+)
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, goal_at_every_frame
 from touchgoal.rewards.goals import Modality
 from touchgoal.rewards.metrics import START_FRAMES
@@ -22,8 +27,6 @@ END_FRAMES = 5  # frames before the last one that stand for the end of a trainin
 MIN_SEPARATED = 0.75
 """Least share of (episode, goal) pairs whose end must be nearer the goal than its start; 0.5 is
 chance. Below it, one unit of the normalised distance would mostly be noise."""
-
-_UNIT_QUANTILE = 0.9
 
 MIN_GAP = 1e-4
 """Least raw distance between the start and the goal median; float32 resolves about 1e-6."""
@@ -77,7 +80,7 @@ def fit_units(episodes: Sequence[EmbeddedEpisode]) -> dict[str, float]:
         together = ends[0].extended(ends[1:])
         others = ~np.eye(len(ends), dtype=bool)
         for name, d in part_distances(together, goal_at_every_frame(together)).items():
-            spreads.setdefault(name, []).append(float(np.quantile(d[others], _UNIT_QUANTILE)))
+            spreads.setdefault(name, []).append(float(np.quantile(d[others], SPREAD_QUANTILE)))
     return {
         name: max(float(np.mean(spread)), SMALLEST_UNIT.get(name, SMALLEST_UNIT["front"]))
         for name, spread in spreads.items()

@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float, Float16, Float32
 from scipy.signal import lfilter
 
 from touchgoal.control.features import IMAGE_PREFIX
+from touchgoal.rewards.curves import UNITS_AT_HALF
 from touchgoal.rewards.features.contact_reading import ContactReadings
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
 
@@ -49,8 +50,7 @@ SMALLEST_UNIT = {
 }
 """Least unit of each part, about the noise of a camera: some demonstrations end almost alike. Other
 cameras have the one of `front`."""
-_HALF = 1.5  # units at which a part costs 0.5
-_SPREAD_QUANTILE = 0.9
+SPREAD_QUANTILE = 0.9  # of distances between ends that all succeeded: their spread
 _FORCE_FLOOR = 0.5  # N, below which the depth of a gel reads noise
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
 _SOFTNESS = 8.0  # exponent of the soft minimum
@@ -144,7 +144,7 @@ def part_costs(episode: EmbeddedEpisode, goal: EmbeddedGoal, units: Mapping[str,
     own, costs = goal_spread(goal), {}
     for name, d in part_distances(episode, goal).items():
         if name in units:
-            half = (_HALF * max(units[name], own.get(name, 0.0))) ** 2
+            half = (UNITS_AT_HALF * max(units[name], own.get(name, 0.0))) ** 2
             square = soft_minimum(d) ** 2
             costs[name] = square / (square + half)
     if episode.readings is None or goal.readings is None:
@@ -164,7 +164,7 @@ def goal_spread(goal: EmbeddedGoal) -> dict[str, float]:
     for name, d in part_distances(goal.as_frames(), goal).items():
         if (n := len(d)) > 1 and name != "slip":
             others = d[~np.eye(n, dtype=bool)].reshape(n, n - 1)
-            spread[name] = float(np.quantile(soft_minimum(others), _SPREAD_QUANTILE))
+            spread[name] = float(np.quantile(soft_minimum(others), SPREAD_QUANTILE))
     return spread
 
 
