@@ -4,6 +4,7 @@ import os
 import sys
 import threading
 import warnings
+from functools import cache
 from typing import Any
 
 import torch
@@ -52,7 +53,6 @@ class CompiledNetwork:
 def _compile(network: nn.Module, height: int, width: int) -> Any:
     # OpenVINO reports its use to its maker unless this is not there.
     sys.modules.setdefault("openvino_telemetry", None)  # pyright: ignore[reportArgumentType]
-    import openvino
     from openvino.frontend import FrontEndManager
     from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
 
@@ -70,4 +70,12 @@ def _compile(network: nn.Module, height: int, width: int) -> Any:
         "INFERENCE_NUM_THREADS": cores,
         "NUM_STREAMS": cores,
     }
-    return openvino.Core().compile_model(model, "CPU", config)
+    return _core().compile_model(model, "CPU", config)
+
+
+@cache
+def _core() -> Any:
+    """Return the process's one Core: when a second ends, it unmaps the stack on which signals are handled."""
+    import openvino
+
+    return openvino.Core()

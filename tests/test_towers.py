@@ -124,6 +124,24 @@ def test_a_compiled_network_computes_what_torch_does_in_any_thread() -> None:
     assert sys.modules["openvino_telemetry"] is None
 
 
+def test_ctrl_c_arrives_after_a_compiled_network_is_gone() -> None:
+    """In a process of its own: with OpenVINO's own Cores it ended in a segmentation fault."""
+    program = """
+import os, signal, torch
+from touchgoal.encoders.compiled_network import CompiledNetwork
+compiled = [CompiledNetwork(torch.nn.Conv2d(3, 4, 3).eval()) for _ in range(2)]
+for one in compiled:
+    one(torch.zeros(1, 3, 8, 8))
+del compiled[0], one
+compiled.clear()
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+except KeyboardInterrupt:
+    print("stopped")"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "stopped\n")
+
+
 def test_missing_wheels_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """The message names the clone, since touchgoal is on no package index."""
     monkeypatch.setattr(efficientnet, "WHEEL", "no_such_wheel")
