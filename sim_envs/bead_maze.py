@@ -173,8 +173,8 @@ def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
         "group": VISUAL_GROUP,
         "rgba": [0.75, 0.76, 0.8, 1],
     }
-    spec.visual.quality.numstacks = 6  # with 16, capsules take most of a render's time
-    maze = spec.worldbody.add_body(name="wire")  # own body: one bounding box to rule it out
+    spec.visual.quality.numstacks = 6  # with 16, drawing the capsules takes most of a render
+    maze = spec.worldbody.add_body(name="wire")  # own body: MuJoCo tests its bounding box first
     for start, end in wire.chords(sag=_SAG, longest=0.012):
         maze.add_geom(size=[WIRE_RADIUS, 0, 0], fromto=[*start, *end], **steel)
     for foot in wire.points[[0, -1]]:

@@ -12,11 +12,9 @@ from jaxtyping import Float32, UInt8
 
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import rig_unit
-from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
-from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 
 FRAMES = 5  # frames of a clip; the first is untouched
 _UNEVEN = 0.1  # share of the relief that is fuzz and slubs
@@ -56,7 +54,8 @@ def press_cloth(config: RigConfig, index: int) -> ClothClip:
     last = float(np.exp(rng.uniform(*np.log(_DEPTHS))))
     turn, tilt = float(rng.uniform(0, 2 * np.pi)), rng.normal(0, 0.01, 2)
     place, on_cloth = rng.normal(0, 1.5e-3, 2), rng.uniform(0, TILE, 2)
-    frames = [_dotted(render_untouched(unit, rng), unit)]
+    # dots at rest: a press without shear hardly moves them
+    frames = [unit.with_dots(render_untouched(unit, rng))]
     for depth in np.linspace(0.4, 1.0, FRAMES - 1) * last:
         place = place + rng.normal(0, _DRIFT, 2)
         pose = SurfacePose(
@@ -66,14 +65,8 @@ def press_cloth(config: RigConfig, index: int) -> ClothClip:
             (float(on_cloth[0]), float(on_cloth[1])),
             float(depth),
         )
-        frames.append(_dotted(press(surface, pose, unit, rng), unit))
+        frames.append(unit.with_dots(press(surface, pose, unit, rng)))
     return ClothClip(np.stack(frames), number)
-
-
-def _dotted(image: np.ndarray, unit: SensorInstance) -> np.ndarray:
-    """Draw the gel's printed dots at rest: a press without shear hardly moves them."""
-    draw(image, unit.markers, unit.marker_radius)
-    return image
 
 
 def _piece(cloth: Cloth, rng: np.random.Generator) -> Surface:
@@ -126,10 +119,6 @@ def _jersey(u: Tile, v: Tile) -> Tile:
     return np.sqrt(np.abs(np.sin(np.pi * (v + 1.2 * fold)))) * (0.4 + 0.6 * _round(2 * u))
 
 
-def _purl(u: Tile, v: Tile) -> Tile:
-    return _round(v + 0.25 * np.sin(2 * np.pi * u))
-
-
 def _ribs(share: float) -> Pattern:
     return lambda u, v: _round(np.minimum((u % 1) / share, 1)) + 0 * v
 
@@ -154,10 +143,6 @@ def _loops(u: Tile, v: Tile) -> Tile:
     return _round(u) * _round(wander)
 
 
-def _nap(u: Tile, v: Tile) -> Tile:
-    return 0.5 + 0 * (u + v)
-
-
 def _quilt(u: Tile, v: Tile) -> Tile:
     return np.sqrt(np.abs(np.sin(np.pi * (u + v)) * np.sin(np.pi * (u - v))))
 
@@ -173,7 +158,7 @@ CLOTHS: tuple[Cloth, ...] = (
     Cloth("satin", (56, 44), 50e-6, _woven(7, 1, 3)),
     Cloth("jersey", (26, 34), 110e-6, _jersey),
     Cloth("chunky knit", (9, 12), 420e-6, _jersey),
-    Cloth("purl", (20, 26), 170e-6, _purl),
+    Cloth("purl", (20, 26), 170e-6, lambda u, v: _round(v + 0.25 * np.sin(2 * np.pi * u))),
     Cloth("rib knit", (18, 26), 280e-6, _rib_knit),
     Cloth("corduroy", (10, 10), 380e-6, _ribs(0.8), fuzz=0.15),
     Cloth("needlecord", (22, 22), 180e-6, _ribs(0.8), fuzz=0.15),
@@ -181,6 +166,6 @@ CLOTHS: tuple[Cloth, ...] = (
     Cloth("waffle", (6, 6), 420e-6, _waffle),
     Cloth("mesh", (14, 14), 260e-6, _mesh),
     Cloth("terry", (14, 18), 380e-6, _loops, fuzz=0.35),
-    Cloth("felt", (8, 8), 130e-6, _nap, fuzz=0.8),
+    Cloth("felt", (8, 8), 130e-6, lambda u, v: 0.5 + 0 * (u + v), fuzz=0.8),
     Cloth("quilt", (4, 4), 450e-6, _quilt),
 )

@@ -53,12 +53,13 @@ def simulate(config: RigConfig, index: int) -> Stroke:
     indenter = config.indenters[index % len(config.indenters)]
     friction = FRICTION * (1 + FRICTION_SPREAD * rng.uniform(-1, 1))
     load, moved, start, direction = _draw_path(config, sensor, friction, rng)
-    shear, slip = shear_force(moved, load, sensor.shear_stiffness, friction)
+    places = moved[:, None] * direction
+    shear, slip = stick_slip_force(places, sensor.shear_stiffness, friction * load)
     unit = rig_unit(config)
     bench = PressBench(_probe(indenter, friction), sensor, unit, config.shear_relief)
     frames, wrenches, fields = [], [], []
     for pressed, way, pull in zip(load.tolist(), moved, shear, strict=True):
-        (x, y), (fx, fy) = (start + way * direction).tolist(), (pull * direction).tolist()
+        (x, y), (fx, fy) = (start + way * direction).tolist(), pull.tolist()
         bench.place(np.array([x, y, 0.0]))
         sensed = bench.sense(pressed, rng, (fx, fy), (x, y), -pressed / sensor.normal_stiffness)
         frames.append(sensed.image)
@@ -73,24 +74,24 @@ def rig_unit(config: RigConfig) -> SensorInstance:
     return sample_instance(find_sensor(config.sensor), np.random.default_rng([config.seed, 0]))
 
 
-def shear_force(
-    moved: Float[np.ndarray, " t"], load: Float[np.ndarray, " t"], stiffness: float, friction: float
-) -> tuple[Float[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
-    """Return tangential force (N) on a gel of `stiffness` N/m, and slip, by frame.
+def stick_slip_force(
+    places: Float[np.ndarray, "t d"], stiffness: float, limits: Float[np.ndarray, " t"] | float
+) -> tuple[Float[np.ndarray, "t d"], Bool[np.ndarray, " t"]]:
+    """Return forces (N) on a gel of `stiffness` N/m under an object at these places (m), and slip.
 
-    The gel follows the probe until friction gives way; after a slide it rests at a new place.
-
-    Args:
-        moved: how far the probe has been drawn, m.
-        load: normal force, N.
+    The gel's rest position is dragged along where the force would exceed the limit (N) of the frame.
+    `places`: x, y and, for turns, angle times the patch's mean radius; the third force is torsion
+    over that radius.
     """
-    force, slides, slid = np.zeros(len(moved)), np.zeros(len(moved), bool), 0.0
-    for i, (way, normal) in enumerate(zip(moved, load, strict=True)):
-        limit = friction * normal
-        force[i] = stiffness * (way - slid)
-        if force[i] > limit:
-            force[i], slid, slides[i] = limit, way - limit / stiffness, normal > 0
-    return force, slides
+    rest = places[0].astype(float)
+    force, slip = np.zeros(places.shape), np.zeros(len(places), bool)
+    for i, limit in enumerate(np.broadcast_to(limits, len(places))):
+        force[i] = stiffness * (places[i] - rest)
+        size = float(np.linalg.norm(force[i]))
+        if size > limit:
+            force[i] *= limit / size
+            rest, slip[i] = places[i] - force[i] / stiffness, True
+    return force, slip
 
 
 def _draw_path(

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.config import RigConfig
-from touchgoal.sim_envs.indenter_rig import FRICTION, REST, rig_unit
+from touchgoal.sim_envs.indenter_rig import FRICTION, REST, rig_unit, stick_slip_force
 from touchgoal.sim_envs.scene.objects import (
     CATALOGUE,
     HARD,
@@ -104,26 +104,6 @@ def _slide(
     whole = np.vstack([np.repeat(pose[:1], REST, 0), pose]).astype(np.float32)
     slides = np.concatenate([np.zeros(REST, bool), slip])
     return Slide(np.stack(frames), wrench, slides, whole, body.kind.name, load)
-
-
-def stick_slip_force(
-    places: Float[np.ndarray, "t d"], stiffness: float, limit: float
-) -> tuple[Float[np.ndarray, "t d"], Bool[np.ndarray, " t"]]:
-    """Return forces (N) on a gel of `stiffness` N/m under an object at these places (m), and slip.
-
-    The gel's rest position is dragged along where the force would exceed `limit` N. `places`: x, y
-    and, for turns, angle times the patch's mean radius; the third force is torsion over that
-    radius.
-    """
-    rest = places[0].astype(float)
-    force, slip = np.zeros(places.shape), np.zeros(len(places), bool)
-    for i, place in enumerate(places):
-        force[i] = stiffness * (place - rest)
-        size = float(np.linalg.norm(force[i]))
-        if size > limit:
-            force[i] *= limit / size
-            rest, slip[i] = place - force[i] / stiffness, True
-    return force, slip
 
 
 def mean_radius(field: ForceField) -> float:

@@ -19,7 +19,6 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
 from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
-from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.pad import TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
@@ -141,8 +140,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         bench.place_wand(
             bench.centre + [0, 0, bench.radius + _AWAY], _axes(np.array([0.0, 0, 1]), 0)
         )
-        clip, load, _ = self._press(np.zeros(3), np.zeros(1))
-        return self._observation(self._render(), clip[-1], float(load[-1])), self._info(False)
+        return self._observe_untouched(), self._info(False)
 
     def step(
         self, action: Float[np.ndarray, "6"]
@@ -151,11 +149,9 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         self.move_object()
         touch = self.touch(np.asarray(action, float))
         if touch is None:
-            clip, load, _ = self._press(np.zeros(3), np.zeros(1))
-            observation = self._observation(self._render(), clip[-1], float(load[-1]))
-        else:
-            observation = self._observation(touch.views, touch.clip[-1], float(touch.load[-1]))
-        return observation, float(touch is not None), False, False, self._info(touch is not None)
+            return self._observe_untouched(), 0.0, False, False, self._info(False)
+        observation = self._observation(touch.views, touch.clip[-1], float(touch.load[-1]))
+        return observation, 1.0, False, False, self._info(True)
 
     def touch(self, action: Float[np.ndarray, "6"]) -> Touch | None:
         """Touch the object where it lies; None if the wand misses it or cannot reach it."""
@@ -181,9 +177,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
 
     def untouched(self, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
         """Return the untouched gel's picture, with the camera's noise drawn from `rng`."""
-        picture = render_untouched(self._instance, rng)
-        draw(picture, self._instance.markers, self._instance.marker_radius)
-        return picture
+        return self._instance.with_dots(render_untouched(self._instance, rng))
 
     def random_action(self) -> Float[np.ndarray, "6"]:
         """Draw a touch as the paper's operator: anywhere, with a force from one of three ranges."""
@@ -285,6 +279,10 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
     ) -> Observation:
         observation = {ft.IMAGE_PREFIX + name: view for name, view in views.items()}
         return observation | {ft.TACTILE_LEFT: picture, ft.LOAD: np.array([load], np.float32)}
+
+    def _observe_untouched(self) -> Observation:
+        clip, _, _ = self._press(np.zeros(3), np.zeros(1))
+        return self._observation(self._render(), clip[-1], 0.0)
 
     def _info(self, touched: bool) -> dict[str, Any]:
         return {ft.TRUTH_CONTACT: np.array([touched, False]), "object": self.object.name}

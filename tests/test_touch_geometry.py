@@ -193,20 +193,16 @@ def test_an_untouched_gel_is_flat() -> None:
 
 
 @pytest.mark.parametrize("force", [1.0, 4.0, 10.0])
-def test_force_from_depth_and_markers(gel: SensorInstance, force: float) -> None:
-    """On a marker gel: depth within 5 %, the normal force within 15 %, shear to the stiffness."""
+def test_force_from_depth(gel: SensorInstance, force: float) -> None:
+    """On a marker gel: depth within 5 %, the normal force within 15 %."""
     frame = press(Body(GLASS, (0.015,), 0.1), force, DOTTED, gel)
     plain = untouched(gel, 1)[0]
     tracker = tracker_of(plain, gel)
-    moved = np.array([3.0, -2.0])
-    image = dotted(render(frame.surface, gel, np.random.default_rng(2)), gel, moved)
+    image = dotted(render(frame.surface, gel, np.random.default_rng(2)), gel, np.array([3.0, -2.0]))
     now = tracker.update(image)
     rest = without_markers(dotted(plain, gel), tracker.rest.positions, gel.marker_radius)
     depth = DepthEstimator(gel.calibration).estimate(
         without_markers(image, now.positions, gel.marker_radius), rest.astype(np.float32)
     )
     assert np.abs(depth - frame.depth).mean() < 0.05 * frame.depth.max()
-    estimate = estimate_force(depth, gel.pixel_pitch, DOTTED, now.positions, tracker.displacement)
-    assert estimate.normal == pytest.approx(force, rel=0.15)
-    expected = DOTTED.shear_stiffness * gel.pixel_pitch * moved
-    assert estimate.shear == pytest.approx(tuple(expected), rel=0.03)
+    assert estimate_force(depth, gel.pixel_pitch, DOTTED) == pytest.approx(force, rel=0.15)

@@ -1,8 +1,8 @@
 """Franka FR3 through franky-control, in a child process.
 
-Commands stream as joint velocities that each last 100 ms: if the child dies or stalls, the arm comes
-to rest by itself. franky's own 1 kHz loop shapes them. A pull towards the commanded position keeps
-the sum of the velocities from drifting.
+Commands are joint velocities that each last 100 ms: if the child dies or stalls, the arm comes to
+rest by itself. franky's own 1 kHz loop smooths them. A proportional term towards the commanded
+position keeps the integrated velocities from drifting.
 """
 
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ RATE = 200.0  # Hz of velocity commands
 STATE_TIMEOUT = 0.5  # s; libfranka itself gives up after 1 s
 _COMMAND_MS = 100  # duration of each command
 _POSITION_GAIN = 10.0  # 1/s towards the commanded position
-_SHARE = 0.9  # share of franky's limits for the stream; the rest is for the pull
+_SHARE = 0.9  # share of franky's limits for the stream; the rest is for the proportional term
 # Nm and N: franky's defaults for libfranka's setCollisionBehavior, above RobotLimits.force.
 _TORQUE_REFLEX, _FORCE_REFLEX = 20.0, 30.0
 

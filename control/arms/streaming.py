@@ -1,4 +1,4 @@
-"""Common part of the Franka's and the UR's drivers: targets become a stream, faults latch.
+"""Common part of the Franka's and the UR's drivers: it streams targets and holds the first fault.
 
 The policy's targets (10 to 20 Hz) go through the tracker, so the stream stays inside the
 interface's limits and ends at rest at the last target.
@@ -21,7 +21,7 @@ from touchgoal.runtime.errors import UserError
 
 _MAX_CATCH_UP = 4  # periods that a late tick makes up for at once
 _BRAKING = 1.5  # s for coming to rest on closing
-_REST, _LOOK = 0.01, 0.05  # rad/s over so many s that count as rest
+_REST, _LOOK = 0.01, 0.05  # rad/s, mean over so many s, below which the arm is at rest
 
 
 @dataclass(frozen=True)

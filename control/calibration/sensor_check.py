@@ -184,7 +184,7 @@ def _read(
                 circle = _contact_circle(touch, calibration, ball_radius)
                 ball = sphere_in(read.depth, pitch, circle, ball_radius)
         drawn = np.rint(touch.plain - read.left).clip(0, 255).astype(np.uint8)
-        force = estimate_force(read.depth, pitch, sensor).normal
+        force = estimate_force(read.depth, pitch, sensor)
         readings.append(
             PressReading(touch.frame, read.depth, drawn, read.unexplained, circle, ball, force)
         )

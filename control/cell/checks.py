@@ -11,7 +11,7 @@ from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime.errors import UserError
 
-# N that a gripper can be set to. A real Franka Hand does no less than 30; a simulated one does.
+# Range of grasp forces, N. The simulated Franka Hand can press less than the real one's least, 30.
 _FORCES = {"franka_hand": (0.0, 70.0), "robotiq": ROBOTIQ_2F85.force}
 _JOINTS = {"fr3": 7, "ur5e": 6, "sim": 7}
 _LEAST_FINGERTIP = 0.01  # m, each side of the box around the fingertips
@@ -83,7 +83,7 @@ def _check_fingertips(cell: CellConfig) -> None:
 
 
 def _check_tool(tool: ToolSection) -> None:
-    """The box around the open fingertips must have a size, and the TCP lie in it."""
+    """Require that the box around the open fingertips has a size and contains the TCP."""
     corners = np.array(tool.finger_corners)
     lower, upper = corners.min(axis=0), corners.max(axis=0)
     if (upper - lower < _LEAST_FINGERTIP).any():
@@ -100,7 +100,7 @@ def _check_tool(tool: ToolSection) -> None:
 
 
 def _check_own_task(task: TaskSection) -> None:
-    """A misspelt name is no task of one's own, and no scripted or shipped policy fits one."""
+    """Refuse a misspelt name, and a scripted or shipped policy for a task of one's own."""
     if near := get_close_matches(task.name, get_args(SimulatedTask), 1, cutoff=0.75):
         raise UserError(
             f"task.name is {task.name}: did you mean {near[0]}? Else choose another name"

@@ -24,7 +24,8 @@ _SETTLING = 12  # readings without a change, after a touch or at the start
 _PART = 5  # first and last of them that are compared
 _SETTLED = 1.5  # counts of local change between their medians; a compressed stream is never still
 _LASTING = 10  # readings of disagreement between gel and load cell before the hint says so
-# Share of a force without a touch added to the free-air load per reading: the wand was tilted.
+# Share of the force on an untouched gel that each reading adds to the free-air load: the wand was
+# tilted.
 _TURNED = 0.02
 _HELD = 5  # readings near the largest force
 _NEAR = 0.1  # share below the largest force that counts as near

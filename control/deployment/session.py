@@ -115,7 +115,7 @@ class Session:
 
     @property
     def _truth(self) -> Truth | None:
-        """What a simulator knows; nothing about a task that is known by its recordings alone."""
+        """Source of a simulator's ground truth; None for a task of one's own, which has none."""
         return None if self.cell.task.own else self.connection.truth
 
     def _move_to_start(self, loop: ControlLoop) -> Ending | None:

@@ -12,7 +12,7 @@ from typing import Literal
 PERIOD = 0.05  # s between looks at the hand
 SPEED = 0.1  # m/s; the hand's fastest
 CLOSED_WIDTH = 2e-3  # m: narrower targets are grasps; smaller changes are not sent
-_MOST_PASSING = 3  # looks in a row that a changing target is waited for
+_MOST_PASSING = 3  # looks in a row for which a changing target delays the next command
 
 LastCommand = Literal["runs", "arrived", "stopped short"]
 """State of the last command; "arrived" before the first."""

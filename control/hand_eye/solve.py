@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from touchgoal.control.hand_eye.board import BoardView
-from touchgoal.control.motion.rotations import Vector3, rotation_matrix, rotation_vector
+from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
 from touchgoal.runtime.errors import UserError
 
 Transform = Float[np.ndarray, "4 4"]
@@ -91,7 +91,7 @@ def calibrate_hand_eye(
 
     def split(parameters: np.ndarray) -> tuple[Lens, Transform, Transform]:
         own = Lens(*(float(value) for value in parameters[:6] * scale))
-        return own, camera @ _small(parameters[6:12]), board @ _small(parameters[12:])
+        return own, camera @ _transform(parameters[6:12]), board @ _transform(parameters[12:])
 
     def residuals(parameters: np.ndarray) -> np.ndarray:
         own, X, Y = split(parameters)
@@ -134,7 +134,7 @@ def _calibrate_lens(
     )  # pyright: ignore[reportCallIssue, reportArgumentType]
     k1, k2 = np.ravel(distortion)[:2]
     lens = Lens(*(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2)))
-    return lens, [_transform(r.ravel(), t.ravel()) for r, t in zip(turns, shifts, strict=True)]
+    return lens, [_transform(np.append(r, t)) for r, t in zip(turns, shifts, strict=True)]
 
 
 def _park_martin(motions: Sequence[Transform], seen: Sequence[Transform]) -> Transform:
@@ -173,7 +173,7 @@ def _standard_errors(
 
 def _board_pose(view: BoardView, lens: Lens) -> Transform:
     _, turn, shift = cv2.solvePnP(view.points, view.pixels, lens.matrix, lens.distortion)
-    return _transform(turn.ravel(), shift.ravel())
+    return _transform(np.append(turn, shift))
 
 
 def _project(
@@ -186,14 +186,10 @@ def _project(
     return np.stack([lens.fx * stretch * x + lens.cx, lens.fy * stretch * y + lens.cy], axis=1)
 
 
-def _small(change: Float[np.ndarray, "6"]) -> Transform:
-    """Return the transform of a rotation vector (rad) and a shift (m)."""
-    return _transform(change[:3], change[3:])
-
-
-def _transform(turn: Vector3, shift: Vector3) -> Transform:
+def _transform(change: Float[np.ndarray, "6"]) -> Transform:
+    """Return the transform of a rotation vector (rad), then a shift (m)."""
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation_matrix(turn), shift
+    T[:3, :3], T[:3, 3] = rotation_matrix(change[:3]), change[3:]
     return T
 
 

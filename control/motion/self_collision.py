@@ -69,7 +69,7 @@ _UR5E = (
 _BODIES = {FR3_ARM.name: _FR3, UR5E_ARM.name: _UR5E}
 _POINT = 1e-12  # m^2; a shorter segment is a point
 _LEAST_GAP = 5e-3  # m
-_NEIGHBOURS = 3  # parts in a row that the joints' ranges alone keep apart
+_NEIGHBOURS = 3  # parts fewer joints apart are not checked: the joints' ranges keep them apart
 
 
 class SelfDistance:

@@ -1,5 +1,4 @@
-"""From a policy's 10 to 20 Hz to a 1 kHz interface: smooth, inside all limits, near the checked
-path.
+"""Tracker that turns a policy's targets (10 to 20 Hz) into a smooth 1 kHz stream inside all limits.
 
 A reference walks in straight lines from target to target, each within the policy's period, or
 slower where it would turn faster than the limits allow. The command is the reference's mean over a

@@ -1,10 +1,11 @@
 """A policy that a server computes: `ws://host:port`.
 
 The server answers an observation with `actions` (ticks, joints + 1), in our units (`features.ACTION`),
-from that tick on. Half of them are executed before the next are asked for; the others bridge a late
-answer, after which an arm holds. An address may name what is sent, in place of all observations under
-their own keys: `ws://gpu:8000?image=observation.images.front&state=observation.state`. `prompt` is the
-task's instruction.
+from that tick on. The first half is executed before the next answer is requested; the second half
+bridges a late answer, and when it is used up an arm holds still. All observations are sent under
+their own keys, unless the address names some:
+`ws://gpu:8000?image=observation.images.front&state=observation.state`. `prompt` is the task's
+instruction.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
-"""Load cell behind a microcontroller that prints lines of text, in a format that is a setting.
+"""Load cell behind a microcontroller that prints lines of text in a configurable format.
 
-Of garbled lines (bytes or line ends lost, bits flipped) 21 % pass as wrong readings without a
-checksum, 0.45 % with an exclusive or, in which like changes cancel, and none of 32,000 with a CRC
-(`tests/test_serial.py`).
+Garbled lines (bytes or line ends lost, bits flipped) pass as wrong readings in 21 % of cases without
+a checksum and in 0.45 % with an exclusive or, in which equal changes cancel; with a CRC none of
+32,000 passed (`tests/test_serial.py`).
 """
 
 import math

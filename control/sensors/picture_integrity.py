@@ -12,20 +12,20 @@ from touchgoal.control.arrays import Picture
 _STRICT = "explode+crccheck+bitstream+buffer"
 _BLOCK = 8  # px of JPEG
 _JUMPS = 5  # number of the largest jumps that are averaged: one block has four sides
-_USUAL = 2.0  # largest over median jump in an intact, coarse JPEG
+_USUAL = 2.0  # ratio of the largest to the median jump in an intact, coarse JPEG
 _SMOOTH = 3.5  # counts; real and simulated pictures at JPEG quality 75 and above stay below 3.4
 _MEASURED = 5  # px of a block's side that must lie clear of dots for it to count
 _DOT = 8.0  # px across, to which pictures with larger dots are scaled down to find them
-_WIDER = 1.6  # diameters that a dark spot may be wide and count as a dot
+_WIDER = 1.6  # width of the widest dark spot that counts as a dot, in dot diameters
 _RIM = 0.25  # diameters around a dot that count as part of it
 _DARKER = 0.12  # share of the usual brightness by which a dot is darker
 _ALL_CHANNELS = np.ones((1, 3))  # their sum
 _BANDS = 8  # bands of a picture, checked for frozen parts
 _STRIDE = 4  # pixels between those compared
-_LEARNING = 20  # first pictures, which show the bands that sensor noise changes
-# av 15, which lerobot 0.6 pins, knows no number of threads.
+_LEARNING = 20  # number of first pictures, which show the bands that sensor noise changes
+_LIVELY = 0.8  # share of these pictures in which a band must change to be watched
+# av 15, which lerobot 0.6 pins, has no argument `threads`.
 _THREADS = {"threads": 1} if int(av.__version__.split(".")[0]) > 15 else {}
-_LIVELY = 0.8  # share of them in which a band must change to be watched
 
 
 class JpegDecoder:
@@ -51,10 +51,10 @@ class JpegDecoder:
 class BrokenBlocks:
     """Finds pictures of a gel from a damaged JPEG, by their change from the last good picture.
 
-    A decoder cannot detect every wrong byte. One that it misses shows as blocks of another
-    brightness, which a smooth gel never has: real changes ignore block borders. Moving dots do look like such blocks,
-    so pixels near dots do not count; `dots` is their diameter as a share of the picture's diagonal,
-    0 without.
+    A decoder cannot detect every wrong byte. A byte that it misses changes the brightness of whole
+    JPEG blocks; real changes of a smooth gel do not stop at block borders. Moving dots look like such
+    blocks, so pixels near dots do not count; `dots` is their diameter as a share of the picture's
+    diagonal, 0 without dots.
     """
 
     def __init__(self, dots: float) -> None:
@@ -62,7 +62,7 @@ class BrokenBlocks:
         self._before: tuple[Picture, Bool[np.ndarray, "h w"] | None] | None = None
 
     def update(self, image: Picture) -> bool:
-        """Return whether a picture is broken; a whole one is what the next is compared with."""
+        """Return whether a picture is broken; the next is compared with the last intact one."""
         spots = _dark_spots(image, self._dots) if self._dots > 0 else None
         if self._before is not None:
             before, dark = self._before

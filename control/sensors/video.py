@@ -1,8 +1,9 @@
 """Cameras and network streams through OpenCV: always the newest frame.
 
-A thread empties the driver's queue into one slot: a slow reader would lag (by 2 s after 3 s).
-Stamps are taken right after the grab; FFmpeg's own are unusable. A source that fails is opened
-again until it comes back; meanwhile frames keep their old stamps.
+A thread keeps only the newest frame of the driver's queue; a slow reader of the queue itself would
+get old frames (2 s old after 3 s). Stamps are taken right after the grab, because FFmpeg's own are
+unusable. A source that fails is opened again until it comes back; meanwhile the last frame is
+returned with its old stamp.
 """
 
 import os
@@ -26,7 +27,7 @@ _REOPEN_INTERVAL = 0.5  # s between attempts
 _LATE_PERIODS = 3.0  # periods without a frame that mean a problem
 _MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
 _FFMPEG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
-_JPEG = b"\xff\xd8"  # what a JPEG begins with
+_JPEG = b"\xff\xd8"  # first bytes of a JPEG
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ class VideoConfig:
     # s after which an identical picture, or part of one, counts as old; infinity for rendered
     # pictures, which lack the noise of real ones
     frozen_after: float = 0.5
-    # identical pictures in a row that it also takes, for a lock-step twin: its time is not the clock's
+    # number of identical pictures in a row that must also have come before they count as old; for a
+    # lock-step twin, whose time is not the wall clock's
     frozen_pictures: int = 0
     gel: bool = False  # a fingertip's: smooth but for its dots, so broken pictures show
     dots: float = 0.0  # diameter of the printed dots as a share of the picture's diagonal; 0: none

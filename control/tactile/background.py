@@ -6,6 +6,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
+from scipy.fft import dct
 
 from touchgoal.control.arrays import AnyPicture, Counts, Picture, Pictures
 from touchgoal.control.tactile.light_gain import GAIN_SPREAD, LARGE_CHANGE, divide_gain, light_gain
@@ -140,8 +141,6 @@ def _high_pass(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 
 @lru_cache
 def cosines(size: int, count: int) -> Float32[np.ndarray, "k size"]:
     """Return the lowest waves of the cosine transform (type II), as orthonormal rows."""
-    k, n = np.arange(min(count, size))[:, None], np.arange(size) + 0.5
-    rows = np.cos(np.pi * k * n / size)
-    rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
-    rows.setflags(write=False)  # it is given to everyone who asks
+    rows = dct(np.eye(size), axis=0, norm="ortho")[:count].astype(np.float32)
+    rows.setflags(write=False)  # cached: all callers share it
     return rows

@@ -92,7 +92,7 @@ class _Level:
         self._coefficients = _coefficients(p.response[..., :waves])
         per_depth = np.tensordot(p.response[:, 9, :waves], self._places, 1)
         self._per_depth = (self._gain * per_depth).astype(np.float32)
-        # As products, cosine transforms of these sizes are faster than cv2.dct.
+        # Cosine transforms of these sizes are faster as matrix products than by cv2.dct.
         self._down, self._across = cosines(h, h), cosines(w, w)
         down, across = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (h, w))
         self._half = np.float32(0.5 / self._pitch)

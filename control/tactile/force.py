@@ -1,4 +1,4 @@
-"""Contact force on a fingertip: from depth and markers, or from the change of its picture."""
+"""Contact force on a fingertip: from depth, or from the change of its picture."""
 
 from dataclasses import dataclass
 
@@ -23,41 +23,15 @@ _COUNTS = (3, 6, 12, 24)  # counts of change; the areas above them are statistic
 _MIN_FRAMES = 50
 
 
-@dataclass(frozen=True)
-class TouchForce:
-    """Force of an object on a sensor, N: pressing is positive; along x and y, if it has markers."""
+def estimate_force(depth: Map, pixel_pitch: float, sensor: SensorModel) -> float:
+    """Estimate the normal force (N) from a depth map (m); `pixel_pitch` is m per px.
 
-    normal: float
-    shear: tuple[float, float] | None
-
-
-def estimate_force(
-    depth: Map,
-    pixel_pitch: float,
-    sensor: SensorModel,
-    markers: Float32[np.ndarray, "*n 2"] | None = None,
-    displacement: Float32[np.ndarray, "*n 2"] | None = None,
-) -> TouchForce:
-    """Estimate the resultant force from a depth map (m) and its markers' displacement.
-
-    Normal: the gel as an elastic foundation, `foundation_modulus` times the volume in contact. Flat
-    faces and edges read too strong because the gel bulges beside them; only the part in view
-    counts. The modulus is nominal: compare a real sensor with one known weight.
-
-    Shear: `shear_stiffness` times the mean displacement of the markers, weighted by depth. Edges
-    cover few markers and are the least certain. Both are in px (`MarkerTracker`); `pixel_pitch` is
-    m per px.
+    The gel is an elastic foundation: `foundation_modulus` times the volume in contact. Flat faces and
+    edges read too strong because the gel bulges beside them; only the part in view counts. The
+    modulus is nominal: compare a real sensor with one known weight.
     """
-    contact = _contact_depth(depth)
-    normal = sensor.foundation_modulus * float(contact.sum()) * pixel_pitch**2
-    if markers is None or displacement is None:
-        return TouchForce(normal, None)
-    at = np.rint(markers.reshape(-1, 2)).astype(int)
-    column, row = np.clip(at, 0, np.array(depth.shape[::-1]) - 1).T
-    weight = contact[row, column].astype(np.float64)
-    moved = weight @ displacement.reshape(-1, 2) / max(float(weight.sum()), 1e-12)
-    x, y = sensor.shear_stiffness * pixel_pitch * moved
-    return TouchForce(normal, (float(x), float(y)))
+    volume = float(_contact_depth(depth).sum()) * pixel_pitch**2
+    return sensor.foundation_modulus * volume
 
 
 def contact_centre(depth: Map, pixel_pitch: float) -> tuple[float, float]:

@@ -22,7 +22,7 @@ _READABLE = 0.8  # share of a depth that must be read
 
 
 class IndentationMeter:
-    """Indentation of one fingertip sensor, from an RGB frame of its untouched gel on."""
+    """Meter of one fingertip's indentation; `untouched` is an RGB frame before any contact."""
 
     def __init__(self, sensor: SensorModel, untouched: Picture) -> None:
         self._detector = ContactDetector(Background(untouched[None]))

@@ -2,9 +2,9 @@
 
 The untouched picture is compared with the sensor file's under other channel orders, mirrors, scales
 and shifts, ignoring each channel's gain. A hypothesis that fits clearly better is the fault. A step
-across half a row is the seam of a torn picture. Presses decide what is left open: a Mini's picture
-is nearly the same mirrored left to right, but the sensor file then explains no press. Printed dots
-and dust do not count.
+across half a row is the seam of a torn picture. Presses decide between hypotheses that fit equally:
+a Mini's untouched picture is nearly the same mirrored left to right, but then its sensor file
+explains no press. Printed dots and dust do not count.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,8 @@ _SAME_UNIT = 0.035  # difference below which the file was made from this very un
 _OPEN = 1.5  # factor on the difference within which presses have to decide
 _EXPLAINS = 0.8  # share of the unexplained change that a better order or mirror may leave
 UNEXPLAINED = 0.65  # share of a press's change that a sensor file may leave unexplained
-_MAX_PRESSES, _CELL = 6, 8  # px
+_MAX_PRESSES = 6  # number of presses that are read
+_CELL = 8  # px, finest cell of the depth that is read
 _STRONGEST = 0.1  # share of the picture over which the explanation is judged
 _COARSE = 4  # px of the sensor's picture to a cell of the comparison
 _DARK = 8.0  # counts added before the logarithm: noise in the dark is no difference

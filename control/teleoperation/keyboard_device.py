@@ -6,11 +6,10 @@ from touchgoal.control.features import Observation
 from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, Verdict
 
 HELP = "w/s away/back  a/d left/right  r/f up/down  j/l yaw  i/k pitch  u/o roll  g grip  h let go"
-# s: a terminal reports no key releases; it repeats a held key after about 0.4 s, and only the last
-# of several.
+# s for which a typed key counts as held. A terminal reports no releases; it repeats a held key after
+# about 0.4 s, and of several held keys only the last.
 _HOLD_SECONDS = 0.5
-# A pair an axis: the key for its positive direction, and the key for the negative one. Pitch is
-# positive with the nose down.
+# One pair of keys for each axis, the positive direction first. Pitch is positive with the nose down.
 _PAIRS = ("ws", "ad", "rf", "ou", "ki", "jl")
 _AXES = {
     key: sign * axis

@@ -1,6 +1,7 @@
-"""A device that picks and places by itself where a simulator says: rehearsal without a person.
+"""Scripted teleoperation device for rehearsals without a person: it picks and places.
 
-It asks for motions of the hand as a SpaceMouse does, and sees the hand's pose and the gripper.
+A simulator gives it the poses of object and goal. It requests hand motions, as a SpaceMouse does,
+from the observed pose of the hand and width of the gripper.
 """
 
 from collections import deque
@@ -18,14 +19,14 @@ from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, V
 _SLOW_WITHIN = 0.06, 0.4  # m and rad from a way-point within which the deflection shrinks
 _REACHED = 0.004, 0.03  # m and rad from a way-point
 _CLEARANCE = 0.12  # m above the object
-_STILL_TICKS = 8  # for which nothing moves: the hand has closed, or the table holds it
-_STILL = 4e-4  # m of position and of width
+_STILL_TICKS = 8  # ticks without motion: the hand has closed, or the table blocks it
+_STILL = 4e-4  # m of position and of width that count as no motion
 _PLACED = 0.015  # m between hand and goal
 _HELD = 0.004  # m of width: less is an empty hand
 
 
 class ScriptedDevice:
-    """Goes from way-point to way-point; it says done if it ends with an object at the goal."""
+    """Goes from way-point to way-point; its verdict is "done" if it ends with an object at the goal."""
 
     verdict: Verdict = ""
 

@@ -28,8 +28,8 @@ _ROOT = Path("/sys/class/hidraw")
 _MAKERS = (0x256F, 0x046D)  # USB vendors: 3Dconnexion, and Logitech for those before 2013
 _LOGITECH_PRODUCTS = range(0xC621, 0xC62C)  # Logitech's 3D mice: 0xC625 to 0xC62B are in use
 _FULL_SCALE = 350.0  # counts at full deflection (`axis_scale` of the table)
-_DEAD_ZONE = 0.06  # share of it: a cap at rest may be off by some counts
-_SILENCE = 0.5  # s without a report after which the cap counts as released: deflected, it reports
+_DEAD_ZONE = 0.06  # share of full deflection; a cap at rest may be off by some counts
+_SILENCE = 0.5  # s without a report after which the cap counts as released
 _LONGEST = 64  # bytes of a report over USB full speed
 # From the device's axes to the base's, for a user who looks the way the robot does.
 _TO_BASE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -41,7 +41,7 @@ class SpaceMouse:
     verdict: Verdict = ""
 
     def __init__(self, root: Path = _ROOT, devices: Path = Path("/dev")) -> None:
-        """Open the one that is plugged in; UserError if there is none or it cannot be read."""
+        """Open the SpaceMouse that is plugged in; UserError if there is none or it is unreadable."""
         path = devices / find_spacemouse(root)
         try:
             self._file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)

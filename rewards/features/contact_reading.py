@@ -109,7 +109,7 @@ class ContactReader:
         if self._depth is None or self._sensor is None or not touching:
             return touching, 0.0, (0.0, 0.0)
         depth = self._depth.estimate(frame, self._detector.background.steady)
-        force = estimate_force(depth, self._pitch, self._sensor).normal
+        force = estimate_force(depth, self._pitch, self._sensor)
         return touching, force, contact_centre(depth, self._pitch)
 
     def _resized(self, frame: Picture) -> Picture:

@@ -210,12 +210,12 @@ class DeployedArm:
         return state
 
     def _moments(self, at: Int[np.ndarray, " t"], end: int) -> set[int]:
-        """Milliseconds of the coming tick at which something is due."""
+        """Return the milliseconds of the coming tick at which something is due."""
         return set(at[(at > self._ms) & (at <= end)].tolist())
 
 
 def measurements_at_rest(q: Joints) -> Measurements:
-    """Return measurements at which the safety layer clamps but never stops: the env does."""
+    """Return measurements at which the safety layer never stops: the environment does that."""
     return Measurements(
         q=q,
         force=np.zeros(3),

@@ -22,7 +22,7 @@ from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, PadContact
 from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 
-DISTURBANCE_SECONDS = 0.5  # for which a disturbance keeps its direction
+DISTURBANCE_SECONDS = 0.5  # s for which a disturbance keeps its direction
 
 
 class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):

@@ -23,7 +23,7 @@ GRIPPER_MAX_WIDTH = FRANKA_HAND.stroke[1]  # m, to which experts open
 GRIPPER_SPEED = FRANKA_HAND.speed  # m/s of width
 _FINGER_LAG = 1e-3  # m by which a freely moving finger lags its set-point, at most
 
-_QUIET = 2.0  # Nm; 20 N on a hand over the table, from any side, load some joint more
+_QUIET = 2.0  # Nm on a joint; 20 N on the hand over the table, from any side, exceed it somewhere
 
 
 class SimulatedHardware(ABC):
@@ -97,8 +97,8 @@ class SimulatedHardware(ABC):
     def contact_force(self) -> Float[np.ndarray, "3"]:
         """Return the robot's contact force (N) in the last step, base frame; 0 if small.
 
-        Contacts are read, which takes as long as a physics step, only if a joint bears over
-        `_QUIET`.
+        Reading contacts takes as long as a physics step, so they are read only if the torque on some
+        joint exceeds `_QUIET`.
         """
         if np.abs(self.data.qfrc_constraint[self.arm_dofs]).max() < _QUIET:
             return np.zeros(3)

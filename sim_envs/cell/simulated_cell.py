@@ -226,10 +226,10 @@ class SimulatedCell:
             "worst": vars(self.worst),
         }
 
-    # Insides.
+    # Internal.
 
     def _apply_nudge(self) -> Joints:
-        """Apply the nudge; its torque (N m) on each joint."""
+        """Apply the nudge; return its torque (N m) on each joint."""
         env = self.env
         force = self._nudge_force if self.time < self._nudged_until else _NO_FORCE
         env.data.xfrc_applied[self._hand, :3] = force

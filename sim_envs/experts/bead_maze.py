@@ -7,10 +7,10 @@ from touchgoal.control.motion.rotations import fingers_across, rotation_matrix, 
 from touchgoal.sim_envs.bead_maze import BeadMaze
 
 _SPEED = 0.025  # m/s along the wire
-_RETURN = 5.8  # 1/s: rate at which a distance to the course is taken back, a quarter at 20 Hz
-_FASTEST = 0.02  # m/s (or, times _LEVER, rad/s) at which it comes back from far away
-_LEAD = 0.006  # m that the commanded bead may be ahead of the real one: more is a jam
-_SLOW = 0.004  # m (or, times _LEVER, rad) off the course at which there is no going on
+_RETURN = 5.8  # 1/s: decay of a deviation from the course, a quarter of it per tick at 20 Hz
+_FASTEST = 0.02  # m/s (or, times _LEVER, rad/s): fastest return from a large deviation
+_LEAD = 0.006  # m that the commanded bead may be ahead of the real one, which may be jammed
+_SLOW = 0.004  # m (or, times _LEVER, rad) of deviation at which motion along the wire stops
 _LEVER = 0.02  # m by which a turn counts as a displacement: the size of the bead
 
 

@@ -15,14 +15,14 @@ from touchgoal.sim_envs.experts.pick_place_plans import (
 from touchgoal.sim_envs.pick_place import PickPlace
 
 _STEEP = 3.0  # m of height per m that the hand is beside its place
-_NEAR, _GRIPPING = 0.006, 0.015  # m beside the object: for fingers to begin to close, to go on
-_OVER, _PLACED = 0.008, 0.014  # m beside the goal: for the object to go down, to stay there
+_NEAR, _GRIPPING = 0.006, 0.015  # m beside the object within which fingers begin, go on to close
+_OVER, _PLACED = 0.008, 0.014  # m beside the goal within which the object is lowered, stays down
 _PLACING = 3.0  # N, upwards on the hand, with which an object is held down where it is placed
 _NOTICEABLE = 1.0  # N that an arm measures reliably
 _BEGUN = GRIPPER_MAX_WIDTH - 0.006  # m of width below which the fingers have begun to close
 _STILL = 0.006  # m/s of width: fingers that something stops
 _SPEED, _CLIMB, _TOUCHDOWN = 0.3, 0.2, 0.01  # m/s: at most over the table, up and down, near it
-_CLOSE = 0.012  # m above its place at which the object is lowered no faster than that
+_CLOSE = 0.012  # m above its place below which the object is lowered at `_TOUCHDOWN` at most
 _PRESS = 5.0  # N, upwards on the hand, above which it gives way
 # m/s per N: slow enough for a hand that feels the table (about 10 N/mm) 0.15 s late not to bounce
 _GIVE, _FASTEST_GIVE = 4e-4, 0.02
@@ -72,14 +72,14 @@ class FeedbackExpert:
             here + (pace + change) / hz, _righted(R, yaw, turn, _RETURN / hz), env.command
         )
         delta = solution.q - env.command
-        if env.max_joint_step is not None:  # all of it slower, not bent by a clamp of single joints
+        if env.max_joint_step is not None:  # slow the whole motion: clamping single joints bends it
             delta *= min(1.0, float((env.max_joint_step / np.maximum(np.abs(delta), 1e-9)).min()))
         return np.append(delta, grip)
 
     def _fetch(
         self, here: np.ndarray, turn: float, width: float
     ) -> tuple[np.ndarray, float, float]:
-        """Velocity (m/s), remaining turn (rad) and width (m) for a hand that holds nothing."""
+        """Return velocity (m/s), remaining turn (rad) and width (m) of a hand that holds nothing."""
         off = self._object - here
         beside = float(np.linalg.norm(off[:2])) + 0.05 * abs(turn)
         reach = _GRIPPING if width < _BEGUN else _NEAR

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,7 @@ CLEARANCE = 0.12  # m above the object before and after the grasp
 LOWEST_GRASP = 0.0185  # m: the sensor case (32.5 mm) must stay above the table
 LOWEST_PLACE = 0.0172
 TOUCHDOWN_DEPTH = 0.010  # m below the grasp's height to look for the table when placing
-SLIDE = 0.002  # m that a slipping object has slid down in the hand when the hand holds it again
+SLIDE = 0.002  # m that a slipping object slides down in the hand before the hand holds it again
 LONGEST_PLAN = 16.0  # s that a slow or repeated grasp may take
 
 _OFF = (0.025, 0.030)  # m beside the goal; success allows 0.02
@@ -93,25 +94,14 @@ def _never_touch(env: PickPlace) -> Plan:
     return _pick_and_place(env, grasp_shift=(0, 0, 0.08), closed=0.03)
 
 
-def _wrong_object(env: PickPlace) -> Plan:
-    return _pick_and_place(env, picked_body("wrong_object"))
-
-
 def _drop(env: PickPlace) -> Plan:
     plan = _pick_and_place(env)
-    return _before(plan, "arrive") + _opened(_from(plan, "arrive"))
+    opened = [replace(waypoint, width=GRIPPER_MAX_WIDTH) for waypoint in _from(plan, "arrive")]
+    return _before(plan, "arrive") + opened
 
 
-def _freeze(env: PickPlace) -> Plan:
-    return _frozen(env, "approach", "close")
-
-
-def _freeze_holding(env: PickPlace) -> Plan:
-    return _frozen(env, "carry", "lower")
-
-
-def _frozen(env: PickPlace, first: str, end: str) -> Plan:
-    """Return a plan that stops at a random time between the begins of two waypoints."""
+def _freeze(env: PickPlace, first: str, end: str) -> Plan:
+    """Return a plan that stops at a random time between the beginnings of two waypoints."""
     plan = _pick_and_place(env)
     begun, moves = _before(plan, first), _before(_from(plan, first), end)
     ends = np.cumsum([move.seconds for move in moves])
@@ -200,8 +190,8 @@ _PLANS: dict[Outcome, Callable[[PickPlace], Plan]] = {
     "regrasped": _regrasped,
     "never_touch": _never_touch,
     "never_lifted": _never_lifted,
-    "freeze": _freeze,
-    "freeze_holding": _freeze_holding,
+    "freeze": partial(_freeze, first="approach", end="close"),
+    "freeze_holding": partial(_freeze, first="carry", end="lower"),
     "drop": _drop,
     "released_early": _released_early,
     "off": _off,
@@ -209,7 +199,7 @@ _PLANS: dict[Outcome, Callable[[PickPlace], Plan]] = {
     "edge_grasp": _edge_grasp,
     "pressed": _pressed,
     "overgripped": _overgripped,
-    "wrong_object": _wrong_object,
+    "wrong_object": partial(_pick_and_place, body=picked_body("wrong_object")),
     "same_shape": _pick_and_place,  # the scene holds another object than the one asked for
 }
 
@@ -222,7 +212,3 @@ def _before(plan: Plan, name: str) -> Plan:
 def _from(plan: Plan, name: str) -> Plan:
     """Return the waypoints from the first one of that name on."""
     return plan[len(_before(plan, name)) :]
-
-
-def _opened(plan: Plan) -> Plan:
-    return [replace(waypoint, width=GRIPPER_MAX_WIDTH) for waypoint in plan]

@@ -126,7 +126,7 @@ class BodyMotion(NamedTuple):
 @njit(cache=True)
 @no_type_check
 def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
-    """Wrenches (N, Nm, world frame) on both pads and robot about their origins; m/s of slip."""
+    """Return wrenches (N, Nm, world frame) on pads and robot about their origins, and slip (m/s)."""
     wrenches, slip = np.zeros((3, 6)), np.zeros(2)
     for i in range(contacts.addresses.size):
         first, second = contacts.geoms[i]

@@ -22,14 +22,14 @@ TRAINED: tuple[Family, ...] = tuple(f for f in FAMILIES if f != HELD_OUT)
 
 LENGTH = 0.40  # m
 STEP = 0.0005  # m of arc between points
-MIN_RADIUS = 0.035  # m: tighter, the 16 mm long bead binds in its clearance
-MAX_SLOPE = 0.6  # rad: steeper, the hand, aligned with the wire, leaves the FR3's comfortable range
+MIN_RADIUS = 0.035  # m: on a tighter bend the 16 mm long bead binds in its clearance
+MAX_SLOPE = 0.6  # rad: a hand aligned with a steeper wire leaves the FR3's comfortable range
 MAX_TURN = 1.6  # rad of heading to either side of the wire's main direction, for the same reason
 CLEARANCE = 0.055  # m between parts of a wire, so that the fingers (29 mm) pass
 APART = 0.005  # m: closer than this (`distance`), two wires count as one
 
 _S = np.arange(0.0, LENGTH + STEP / 2, STEP)
-# Test and validation wires are chosen first and for good: training wires give way to them.
+# Test and validation wires are chosen first, so that training wires like them are left out.
 PER_FAMILY: dict[Split, int] = {"test": 50, "validation": 20, "training": 1000}
 
 

@@ -53,7 +53,7 @@ class ForceField:
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _pool(pressure, area, out):
-    """Sum Pa per pressure cell of `area` m^2 to N per force cell, two by two."""
+    """Sum pressure (Pa) on 2 x 2 cells of `area` m^2 to the force (N) on one force cell."""
     for i in range(out.shape[0]):
         row, above, below = out[i], pressure[2 * i], pressure[2 * i + 1]
         for j in range(out.shape[1]):

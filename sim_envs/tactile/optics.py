@@ -149,6 +149,6 @@ def render_untouched(
     """Render the RGB frame of an untouched gel: background and noise."""
     oy, ox = rng.integers(0, NOISE_MARGIN, 2)
     _, h, w = instance.background.shape
-    frame = instance.background + instance.noise[:, oy : oy + h, ox : ox + w]  # in COUNT_STEPs
+    frame = instance.background + instance.noise[:, oy : oy + h, ox : ox + w]  # COUNT_STEP
     planes = np.clip(np.float32(COUNT_STEP) * frame + np.float32(0.5), 0, 255).astype(np.uint8)
     return cv2.merge([planes[0], planes[1], planes[2]])

@@ -114,8 +114,7 @@ class TactilePad:
 
     def _untouched(self, rng: np.random.Generator) -> TactileFrame:
         self._field = None
-        image = render_untouched(self._instance, rng)
-        draw(image, self._instance.markers, self._instance.marker_radius)
+        image = self._instance.with_dots(render_untouched(self._instance, rng))
         flat = np.zeros((self._image_grid.rows, self._image_grid.columns), np.float32)
         return TactileFrame(image, flat, flat, None)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int8, Int16, Shaped
+from jaxtyping import Float, Float32, Int8, Int16, Shaped, UInt8
 
 from touchgoal.control.tactile.sensor_calibration import (
     SensorCalibration,
@@ -14,7 +14,7 @@ from touchgoal.control.tactile.sensor_calibration import (
 )
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.sim_envs.config import SensorRandomization
-from touchgoal.sim_envs.tactile.markers import rest_positions
+from touchgoal.sim_envs.tactile.markers import draw, rest_positions
 
 NOISE_MARGIN = 64  # px by which the noise tile is larger than a frame
 COUNT_STEP = 1 / 16  # counts: fine enough, and small enough numbers for the processor's cache
@@ -25,9 +25,10 @@ class SensorInstance:
     """One simulated sensor: its sensor file, varied as two of a model differ."""
 
     calibration: SensorCalibration
-    background: Int16[np.ndarray, "3 h w"]  # the untouched frame, RGB in STEPs
+    background: Int16[np.ndarray, "3 h w"]  # the untouched frame, RGB in units of COUNT_STEP
     illumination: Float32[np.ndarray, "3 h3 w3"]  # light by channel, at half the image's resolution
-    noise: Int8[np.ndarray, "3 h2 w2"]  # camera noise in STEPs, larger by NOISE_MARGIN
+    # camera noise in units of COUNT_STEP, on a tile larger than the frame by NOISE_MARGIN
+    noise: Int8[np.ndarray, "3 h2 w2"]
     markers: Float32[np.ndarray, "n 2"]  # resting dots (x, y), px; none on a plain gel
     marker_radius: float  # px
 
@@ -35,6 +36,11 @@ class SensorInstance:
     def pixel_pitch(self) -> float:
         """m per pixel."""
         return self.calibration.pixel_pitch
+
+    def with_dots(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """Draw the resting dots into an image, in place, and return it."""
+        draw(image, self.markers, self.marker_radius)
+        return image
 
 
 def sample_instance(

@@ -40,7 +40,7 @@ class LockStep:
         self._left = 0  # steps asked for and not yet made
         self._driven, self._issued, self._until = False, 0, 0.0
         self._commands_before = self._answers_before = 0
-        self._asked = False  # whether an answer is owed
+        self._asked = False  # whether the holder waits for an answer
 
     def hold(self, client: ClientConnection) -> dict[str, Any]:
         """Give the time to a client until it leaves; UserError if another holds it."""

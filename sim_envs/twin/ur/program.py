@@ -24,7 +24,7 @@ _WITHOUT_EFFECT = {0, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, gains, a k
 _UNANSWERED = {25, 66}  # toolContact, directTorque: clients do not read an answer
 _REFUSAL_CYCLES = 250  # 0.5 s at most; a client that waits for an answer gives up much earlier
 _STOP_SCRIPT = 255
-_PACE = 1e-3, 40.0  # rad/s or m/s, and those per s: least and most that ur-rtde lets through
+_PACE = 1e-3, 40.0  # least and most that ur-rtde accepts: speed (rad/s, m/s), acceleration (per s)
 
 _SERVO_ACCELERATION = 40.0  # rad/s^2, the most that ur-rtde lets a client ask for
 _STILL = 1e-3  # rad/s
@@ -116,7 +116,7 @@ class _LineMove:
 
 @dataclass
 class _Servo:
-    """`servoj`: follow a goal (rad) that changes all the time, about `lookahead` s behind it."""
+    """`servoj`: follow a goal (rad) that keeps changing, about `lookahead` s behind it."""
 
     speed: Joints
     goal: Joints
