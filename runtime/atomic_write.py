@@ -15,8 +15,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary name to write to; move the file to `path` once it is on disk.
 
     Its folder is made if needed. For two files, nest the blocks: the outer block's file is replaced
-    last. A block that fails leaves the older file as it was. OSError, with the path: it cannot be
-    written; a library's own report of a full disk counts, too.
+    last. A block that fails leaves the older file as it was. OSError, with the path, if it cannot be
+    written, also where a library reports a full disk by an exception of its own.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + ".tmp")

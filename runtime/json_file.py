@@ -1,4 +1,4 @@
-"""JSON as it is read and written here: no key twice, no NaN, no half file."""
+"""JSON files: keys must be unique, and a file is written whole or not at all."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(value) < len(pairs):
         keys = [key for key, _ in pairs]
         twice = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f"the key {twice!r} stands twice")
+        raise ValueError(f"the key {twice!r} is given twice")
     return value
 
 

@@ -33,7 +33,7 @@ def check_writable(out: Path | None) -> None:
 
 
 def open_run(out: Path | None, command: str, config: Any, adds: bool = False) -> Path:
-    """Make the folder of a run, hold it until `release_runs`, and write the run's record into it.
+    """Make the folder of a run, lock it until `release_runs`, and write the run's record into it.
 
     The folder is `runs/<date>_<command>` where the user named none. The first run's record is
     `config.json`; later ones, which add to what the folder holds, are `config_2.json` and so on.

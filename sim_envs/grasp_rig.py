@@ -27,7 +27,7 @@ _ASIDE, _ABOVE = 8e-3, (-4e-3, 10e-3)  # m from the object's middle, along the p
 _TURN = math.radians(12)  # largest turn of the object against the pads
 _OPEN, _CLOSING, _LIFTING = 0.04, 0.08, 0.1  # m of one finger; m/s of one finger; m/s
 _LOOKS = 0.05  # s between readings of the pads, whose stick and slip depend on earlier readings
-_SHOWN_AT, _TOP = 0.01, 0.06  # m of lift
+_SHOWN_AT, _TOP = 0.01, 0.06  # m of lift: at the third image, before the shake
 _SHAKE, _SHAKES, _SHAKING = 0.012, 3.0, 1.0  # m, Hz, s
 _LOWEST = 0.018  # m: lowest height of the pads' middle above the table
 

@@ -90,7 +90,7 @@ def test_a_flipped_byte_is_noticed_or_without_effect(small: Path, name: str) -> 
     ("old", "new", "message"),
     [
         ('"fps": 20', '"fps": 0', "wrong fps = 0"),
-        ('"fps": 20', '"fps": 20, "fps": 30', "the key 'fps' stands twice"),
+        ('"fps": 20', '"fps": 20, "fps": 30', "the key 'fps' is given twice"),
         ('"features": {', '"features": 3, "f": {', "wrong features"),
         (ft.WRIST, ft.WRIST.replace("wrist", "wrast"), "unknown feature .*wrast"),
     ],

@@ -1,7 +1,7 @@
 """Inputs that a policy's success depends on: each one replaced by another episode's, tick by tick.
 
-A policy that does as well without its touch does not feel. The other episode is a run of the same
-policy on the next wire or in the next scene; where it is shorter, its last tick stays.
+A policy that does as well with another episode's touch does not use touch. The other episode is a run
+of the same policy on the next wire or in the next scene; if it is shorter, its last tick is repeated.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -42,7 +42,7 @@ class _Watched:
 
 @dataclass
 class _Replaced:
-    """A policy that gets some columns from another episode."""
+    """A policy that observes some columns of another episode."""
 
     policy: Actor
     keys: tuple[str, ...]
@@ -80,7 +80,7 @@ def _inputs(env: TaskConfig) -> dict[str, tuple[str, ...]]:
 def _audit(
     env: TaskConfig, maker: PolicyMaker, pair: tuple[EpisodeSpec, EpisodeSpec]
 ) -> dict[str, Trial]:
-    """Run the second episode as it is, then the first with one input after the other from the second."""
+    """Run the second episode unchanged, then the first with each of its inputs taken from the second."""
     spec, other = pair
     watched: list[_Watched] = []
 

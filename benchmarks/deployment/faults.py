@@ -66,14 +66,14 @@ _FORKSERVER.set_forkserver_preload([__name__])
 
 @dataclass(frozen=True)
 class FaultCase:
-    """One fault: a line to the twin's port, or a signal, or a policy, or none of these."""
+    """One fault: an order to the twin, a broken policy, a killed process or a full disk; or none."""
 
     name: str
-    control_line: str = ""
+    control_line: str = ""  # order to the twin's control port
     policy: str = "expert"
-    kills: bool = False
-    full: bool = False
-    carrying: bool = False  # fault once the object is in the air, not as soon as the arm moves
+    kills: bool = False  # kill the deployment's process
+    full: bool = False  # let the disk be full
+    carrying: bool = False  # inject the fault once the object is in the air, not once the arm moves
 
 
 CASES = (

@@ -1,6 +1,7 @@
-"""Success in the environment under late observations, plans and commands, or by cause.
+"""Success in the environment under late observations, plans and commands, or by cause of failure.
 
-The arm is as deployed otherwise. By cause: each part of `--env.as-deployed` alone, and all the others.
+With delays the arm is otherwise as deployed. By cause, each part of `--env.as-deployed` acts alone,
+and then all parts but this one.
 """
 
 from collections.abc import Iterator

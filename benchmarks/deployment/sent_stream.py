@@ -32,7 +32,7 @@ Path = Float[np.ndarray, "t n"]
 
 _DT = 1e-3  # s
 _LATE = 0.3  # share of the commands that are late, by up to a tick
-_PUSH_SECONDS = 1.25  # s for which a wild policy pushes one way
+_PUSH_SECONDS = 1.25  # s for which a wild policy keeps its direction
 _ROUNDING = 1e-12  # rad
 _PIECE = 10.0  # s of motion that are judged together
 

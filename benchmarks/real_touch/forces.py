@@ -44,7 +44,7 @@ _FIRST = 5  # untouched frames at the start
 _LASTING = 3  # frames that a fall of the cost must last
 _FALLEN = 0.05  # share of the whole fall that counts as its start
 _NEAR = 3  # frames between force and fall of the cost that count as close
-_STEADY = 0.2  # N, range of the first frames' force if the hand is open
+_STEADY = 0.2  # N: a smaller range of the first frames' force means an open hand
 _IMPOSSIBLE = 60.0  # N, a spike of the load cell: the hand cannot do that
 
 
@@ -58,9 +58,9 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def judge_depth(grasps: list[ForceGrasp]) -> dict[str, float]:
-    """Return for each grasp how force from depth ranks its frames in contact as the load cell does.
+    """Return for each grasp the rank correlation of force from depth with the load cell, in contact.
 
-    It is the force that a reward's part compares, read without any calibration on a load cell.
+    It is the force that a reward's force part compares; it needs no calibration on a load cell.
     """
     ranks = {}
     for grasp in track(grasps, "reading depth", "grasp"):

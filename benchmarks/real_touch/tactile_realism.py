@@ -1,8 +1,8 @@
 """Simulated against held-out real presses of a ball on two sensors.
 
-Each split fits a sensor file to some presses (of the taxim wheel) and predicts the others, beside the
-background alone and Taxim's table, which was made from all of them. Model choices were made on the
-fitted presses of the first split.
+Each split fits a sensor file to some presses (of the taxim wheel) and predicts the others. The
+background alone and Taxim's table, which was made from all presses, are judged beside it. Model
+choices were made on the fitted presses of the first split.
 """
 
 from collections.abc import Iterator
@@ -50,8 +50,8 @@ _TAXIM_LABELLED = {"gelsight": (2e-3, 0.4), "gelsight_mini": (3e-3, 0.0)}
 _TAXIM_MOVED = {"gelsight": (2e-3, 0.4), "gelsight_mini": (1e-3, 0.4)}
 _LEGEND = """corrected: labels corrected by a line fitted to the fitted presses, without the held-out
 picture; moved: circles fitted to the held-out picture"""
-_CUT = 120, 160  # rows and columns of the examples in the picture
-_EXAMPLES_PER_SENSOR = 2  # of each sensor
+_CUT = 120, 160  # rows and columns of an example in the picture
+_EXAMPLES_PER_SENSOR = 2
 
 Colours = Float32[np.ndarray, "h w 3"]
 

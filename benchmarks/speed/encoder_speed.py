@@ -1,7 +1,8 @@
 """Touch embeddings a second on one core (Sparsh, Table 3).
 
-The peer of each ViT is `torch.nn.TransformerEncoder` of the same size, timed in turn with it, with and
-without torch's fused inference; the faster counts. A tick goes from a raw frame to its embedding.
+Each ViT is compared with a peer, a `torch.nn.TransformerEncoder` of the same size, timed alternately
+with and without torch's fused inference; the faster one counts. A tick is the time from a raw frame to
+its embedding.
 """
 
 import copy

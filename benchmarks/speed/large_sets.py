@@ -2,8 +2,8 @@
 
     python -m touchgoal.benchmarks.speed.large_sets --episodes 20000 --root /dev/shm/large_set
 
-Episodes have two frames and no pictures. Times are the process's own, s; opening and checking are divided
-by the thousands in the set.
+Episodes have two frames and no pictures. Times are processor time, s; those of opening and checking are
+per thousand episodes in the set.
 """
 
 import resource

@@ -44,7 +44,7 @@ class Config(BenchmarkOptions):
 
 @dataclass(frozen=True)
 class Job:
-    """Work on each of several items, whose results this process takes."""
+    """Work on each of several items; this process receives the results by `take`."""
 
     name: str
     unit: str
@@ -92,7 +92,7 @@ def _workers(cores: int, ray: bool) -> Iterator[Workers]:
         from ray.cluster_utils import Cluster
     except ImportError:
         raise UserError(f"the half on Ray needs it: {install_extra('ray')}") from None
-    # It reports nothing to its makers; its workers do not give way to everything else.
+    # Ray sends no usage statistics, and its workers run at normal priority.
     os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
     cluster = Cluster(True, head_node_args={"num_cpus": cores, "include_dashboard": False})
     try:

@@ -35,7 +35,7 @@ SQUARES_MINIMUM = 40
 _MIN_SPREAD = 0.1
 _WINDOWS = (4.0, 8.0, 16.0, 32.0, 64.0)  # px
 _DEPTH_PRESSES = 12  # presses whose depth decides on the illumination exponent
-_FAR = 4.0  # contact radii beyond which a press leaves the gel at rest
+_FAR = 4.0  # contact radii beyond which a press does not change the background
 
 
 @dataclass(frozen=True)

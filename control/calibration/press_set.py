@@ -21,7 +21,7 @@ MINIMUM = 16
 # A pressed ball changes the picture by tens of counts. Camera noise is about 1 count (0.5 in the
 # mean of a few hundred pixels); slow drift of the light reached 7.
 _VISIBLE = 10.0
-_FAR = 3.0  # contact radii beyond which a press leaves the gel at rest
+_FAR = 3.0  # contact radii beyond which a press does not change the picture
 _LINE_ROUNDS, _LINE_TOLERANCE = 4, 1.0  # rounds and tolerance (counts) of the robust line
 
 

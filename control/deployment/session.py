@@ -94,7 +94,10 @@ class Session:
             self.camera_size,
         )
         try:
-            ending = self._move_to_start(loop) or self._run_actor(loop, log)
+            ending = self._move_to_start(loop)
+            if ending is None:
+                with closing(self.make_actor(loop)) as actor:
+                    ending = loop.run(actor, self.cell.task.seconds, log)
         finally:
             watch.close()
         picked = self.execute and scripted and ending.reason == PLAN_ENDED
@@ -148,10 +151,6 @@ class Session:
         """Return the newest image of front and wrist camera, in this order, of those present."""
         cameras = self.connection.cameras
         return {key: cameras[key].read().image for key in ft.CAMERAS if key in cameras}
-
-    def _run_actor(self, loop: ControlLoop, log: RunLog) -> Ending:
-        with closing(self.make_actor(loop)) as actor:
-            return loop.run(actor, self.cell.task.seconds, log)
 
     def _success(self, ending: Ending) -> bool | None:
         """Return the outcome; a run that was stopped is no success, whatever the task looks like."""

@@ -77,7 +77,7 @@ def align(
         )
     loss, best = AlignmentLoss(encoder, config), copy.deepcopy(encoder)
 
-    def keep_best(history: list[dict[str, Any]], _: dict[str, Any]) -> None:
+    def update_best(history: list[dict[str, Any]], _: dict[str, Any]) -> None:
         if max(history, key=_score) is history[-1]:
             best.load_state_dict(encoder.state_dict())
 
@@ -93,7 +93,7 @@ def align(
         },
         evaluate=lambda: evaluate_retrieval(encoder, choosing) | loss_and_floors(loss, data),
         progress=_progress,
-        after_epoch=keep_best,
+        after_epoch=update_best,
         extra_state={"best": best},
     )
     history, provenance = fit(training, out_dir, options, recipe)
@@ -216,7 +216,7 @@ def batch_losses(
             terms["loss_image_text"] = nce(batch.image[c], batch.text[c], tau, same_c)
             loss = loss + config.image_text_weight * terms["loss_image_text"]
     else:
-        loss = loss + 0 * batch.image.sum()  # several processes expect a gradient of every head
+        loss = loss + 0 * batch.image.sum()  # with several processes every head needs a gradient
     return {"loss": loss} | terms
 
 

@@ -130,7 +130,7 @@ def augment(
 
 def _shifted(touch: Tensor, most: int, noise: BatchNoise) -> Tensor:
     height, width = touch.shape[2:]
-    moves = noise.randint(0, 2 * most + 1, (len(touch), 2)).tolist()
+    moves = noise.randint(2 * most + 1, (len(touch), 2)).tolist()
     padded = F.pad(touch, (most,) * 4)
     return torch.stack(
         [

@@ -27,7 +27,7 @@ class DescribedTouches:
     """n touches of objects on which there are sentences."""
 
     touch: Float32[np.ndarray, "n d"]  # embeddings
-    object: tuple[str, ...]  # name of what each touches
+    object: tuple[str, ...]  # name of the object of each touch
     sentences: dict[str, list[str]]  # on each object
     image: Float[Tensor, "n v i"] | None = None  # image tower's embeddings of views of each
 

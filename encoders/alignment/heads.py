@@ -1,7 +1,7 @@
 """Linear heads from frozen towers' image and sentence embeddings to frozen touch embeddings.
 
-Touch embeddings do not change, so neither does what they distinguish. Mapping sentences to touch by
-W ranks pairs like mapping touch to sentences by W transposed, so the direction loses nothing.
+Touch embeddings stay as they are, so they distinguish touches as well as before. Mapping sentences to
+touch by W ranks pairs like mapping touch to sentences by the transpose of W, so nothing is lost.
 """
 
 from dataclasses import dataclass

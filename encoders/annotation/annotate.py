@@ -25,7 +25,7 @@ from touchgoal.runtime.picture_file import read_picture
 from touchgoal.runtime.progress import track
 
 ANNOTATIONS, LEFT_OUT = "annotations.jsonl", "left_out.jsonl"
-_SENSOR_SOUGHT = 5  # first frames in which the sensor is looked for: it may not be in the reference
+_SENSOR_SOUGHT = 5  # first frames in which the sensor is looked for: the reference may not show it
 
 
 def annotate_all(

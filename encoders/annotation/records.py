@@ -44,7 +44,7 @@ class AnnotatedTouch:
     instances: Annotated[tuple[Instance, ...], Field(min_length=1)]
     touched: Annotated[int, Field(ge=0)]  # index of the touched one
     overlap: float  # IoU of its box and the sensor's box at the contact
-    object: str  # id of the touched object: its caption, or what a person wrote in its place
+    object: str  # id of the touched object: its caption, or a person's correction of it
     dropped: dict[str, int]  # number of boxes that were not taken for objects, by reason
     contact: Contact
     provenance: dict[str, Any]  # models, thresholds and prompts
@@ -72,17 +72,13 @@ Line = TypeVar("Line", AnnotatedTouch, LeftOutRecording)
 
 
 class LinesFile(Generic[Line]):
-    """A JSONL file that grows; a last line that a kill cut short is removed when it is opened to write."""
+    """A JSONL file of records of one class, to which lines are appended; it need not exist."""
 
     def __init__(self, path: Path, kind: type[Line]) -> None:
-        """Name a file, which need not exist, and what its lines are."""
         self.path, self._lines = path, TypeAdapter(kind)
 
     def read(self) -> Iterator[Line]:
-        """Yield the lines, of a file that need not exist.
-
-        UserError: a line is broken.
-        """
+        """Yield the records; UserError if a line is broken."""
         if not self.path.exists():
             return
         with self.path.open("rb") as lines:
@@ -98,7 +94,7 @@ class LinesFile(Generic[Line]):
                     ) from error
 
     def remove_unfinished(self) -> None:
-        """Cut off a last line without its end."""
+        """Cut off a last line that a kill left unfinished."""
         if self.path.exists():
             data = self.path.read_bytes()
             if data and not data.endswith(b"\n"):

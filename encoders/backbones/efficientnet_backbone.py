@@ -3,12 +3,11 @@
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from touchgoal.encoders.backbones.pooled_encoder import LAST_BLOCK, STAGES, draw, pool_stages
+from touchgoal.encoders.backbones.pooled_encoder import LAST_BLOCK, STAGES, as_images, pool_stages
 from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 
-_FROZEN = (
-    3  # blocks that keep ImageNet's weights: edges, at strides 2 and 4; they take half of the time
-)
+# First blocks, at strides 2 and 4, which keep ImageNet's weights: edges, half of the computing time.
+_FROZEN = 3
 
 
 class EfficientNetBackbone(nn.Module):
@@ -34,4 +33,4 @@ class EfficientNetBackbone(nn.Module):
     ) -> Float[Tensor, "n d"]:
         """Return the features of preprocessed frames; it has no patches to leave out."""
         assert ids_keep is None, "a convolutional network cannot leave patches out"
-        return pool_stages(self.stem, self.blocks, draw(touch, self.scale))
+        return pool_stages(self.stem, self.blocks, as_images(touch, self.scale))

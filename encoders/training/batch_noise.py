@@ -38,11 +38,9 @@ class BatchNoise:
         """Return uniform numbers in [0, 1) of this shape, rows first."""
         return self.draw(shape[0], lambda n, g: torch.rand(n, *shape[1:], generator=g))
 
-    def randint(self, low: int, high: int, shape: torch.Size | tuple[int, ...]) -> Tensor:
-        """Return integers from `low` to `high - 1` of this shape, rows first."""
-        return self.draw(
-            shape[0], lambda n, g: torch.randint(low, high, (n, *shape[1:]), generator=g)
-        )
+    def randint(self, high: int, shape: torch.Size | tuple[int, ...]) -> Tensor:
+        """Return integers from 0 to `high - 1` of this shape, rows first."""
+        return self.draw(shape[0], lambda n, g: torch.randint(high, (n, *shape[1:]), generator=g))
 
 
 def _take(drawn: Any, own: slice) -> Any:

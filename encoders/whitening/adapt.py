@@ -33,7 +33,7 @@ def adapt(
     every = torch.cat(pooled).double().numpy()
     names = np.repeat(objects, [len(rows) for rows in pooled])
     covariance = (1 - share) * encoder.covariance + share * within_classes(every, names)
-    # Words and pictures of the old whitening would lie elsewhere in the new one.
+    # The maps of sentences and images were fitted to the old whitening, so they do not fit the new one.
     plain = replace(encoder.config, towers=None, text_dim=0, text_hidden=0, image_dim=0)
     adapted = PooledEncoder(plain).fit(every.mean(0), inverse_square_root(covariance, 0.0))
     ranked = [i for i, video in enumerate(videos) if video.ranks is not None]

@@ -25,8 +25,8 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_in
 _UNITS = 48
 _BATCH = 32
 _SHRINKAGE = 0.1  # share of a sphere; 0.01 to 0.3 separate real objects equally well
-_VISIBLE = 4.0  # counts: least change of a visible press, else another is drawn
-_TRIES = 3
+_VISIBLE = 4.0  # counts: least change of a visible press
+_TRIES = 3  # presses that are drawn until one is visible
 # Brightness change between the two images, common and by channel; JPEG quality; share of compressed
 # streams.
 _COMMON_DRIFT, _CHANNEL_DRIFT = 0.03, 0.01

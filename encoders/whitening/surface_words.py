@@ -1,8 +1,8 @@
 """Sentences on how a random surface feels: roughness and bumpiness, from its height map.
 
-The ranks are PhysiCLeAR's. Hardness has no words here: the softness of a random surface says little
-about its real tactile image, and such words did harm (hardness of real objects was at chance,
-accuracy on seen objects fell from 0.80 to 0.59).
+The ranks are PhysiCLeAR's. There are no sentences on hardness: a random surface's softness says
+little about real tactile images, and with them the hardness of real objects was read at chance and
+accuracy on seen objects fell from 0.80 to 0.59.
 """
 
 import numpy as np

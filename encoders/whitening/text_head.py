@@ -53,7 +53,7 @@ def fit_text_head(
     weight /= weight.sum()
     mean = weight @ texts
     apart = texts - mean
-    # The dual form: far fewer sentences than numbers in each.
+    # The dual form: there are far fewer sentences than dimensions.
     inner = apart @ apart.T + _STRENGTH * torch.diag(1 / weight)
     matrix = apart.T @ torch.linalg.solve(inner, torch.stack(places).double())
     head = TowerMap(texts.shape[1], touches.shape[1])

@@ -44,7 +44,7 @@ def add_noise(
         t = _broadcast(time, clean)
         target = clean - added if config.prediction_type == "velocity" else clean
         return (1 - t) * added + t * clean, FLOW_TIME_SCALE * time, target
-    step = noise.randint(0, config.num_train_timesteps, (b,))
+    step = noise.randint(config.num_train_timesteps, (b,))
     power = _broadcast(alphas_cumprod(config.num_train_timesteps)[step].to(clean), clean)
     noisy = power.sqrt() * clean + (1 - power).sqrt() * added
     return noisy, step.to(clean), added if config.prediction_type == "epsilon" else clean

@@ -18,7 +18,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Results = Generator[Result, None, None]
 
-_AHEAD = 8  # items a core in work or waiting to be read, so that a slow one keeps no core idle
+_AHEAD = 8  # items per core, in work or waiting to be read, so that a slow one leaves no core idle
 
 
 def parallel_map(
@@ -26,13 +26,13 @@ def parallel_map(
 ) -> "closing[Results[Result]]":
     """Compute the function of each item: `with parallel_map(…) as results:`, in the items' order.
 
-    Each result comes once. If a worker dies or a node is lost, what it had not handed over is computed
-    again: the function must depend on its item alone. A few items a core are computed ahead of the
-    reader. The workers end with the block. UserError: there is no such cluster, or the workers of an
-    item die again and again.
+    Each result comes once. If a worker dies or a node is lost, its items without a result are computed
+    again, so the function must depend on its item alone. A few items per core are computed ahead of
+    the reader. The workers end with the block. UserError: there is no such cluster, or the workers of
+    an item die again and again.
 
     Args:
-        function: must pickle; on Ray every node needs this version of touchgoal, and what is read.
+        function: must pickle; on Ray every node needs this version of touchgoal and the files it reads.
     """
     if isinstance(workers, str):
         return closing(_map_on_ray(function, items, workers))

@@ -28,7 +28,7 @@ class RayCluster:
 
         Ray retries after deaths, and computes a result again if it is lost with its node.
         """
-        sent = self.ray.put(function)  # once a node, not once an item
+        sent = self.ray.put(function)  # is sent once per node, not once per item
         task = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
         return lambda item: task.remote(sent, item)
 
@@ -45,7 +45,7 @@ class RayCluster:
 
 @contextmanager
 def ray_cluster(address: str) -> Iterator[RayCluster]:
-    """Connect to a cluster; at the end its work for this process is dropped.
+    """Connect to a cluster; at the end unfinished work of this process is dropped.
 
     UserError: Ray is not installed, or no cluster answers.
     """

@@ -90,7 +90,7 @@ class ControlPort(Service):
         self.hold()
 
     def hold(self) -> None:
-        """Execute commands while time stands."""
+        """Execute commands that have arrived, without advancing the time of a freeze."""
         for client in self._listener.poll():
             for line in client.lines():
                 if _HTTP.search(line):
