@@ -141,6 +141,6 @@ def _high_pass(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 
 @lru_cache
 def cosines(size: int, count: int) -> Float32[np.ndarray, "k size"]:
     """Return the lowest waves of the cosine transform (type II), as orthonormal rows."""
-    rows = dct(np.eye(size), axis=0, norm="ortho")[:count].astype(np.float32)
+    rows = np.asarray(dct(np.eye(size), axis=0, norm="ortho"), np.float32)[:count]
     rows.setflags(write=False)  # cached: all callers share it
     return rows
