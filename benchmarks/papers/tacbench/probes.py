@@ -141,7 +141,7 @@ def train_reader(
     least = float("inf")
 
     def batch(rows: Tensor, noise: BatchNoise) -> dict[str, Tensor]:
-        drawn = train[noise.randint(0, len(train), (len(rows),))]
+        drawn = train[noise.randint(len(train), (len(rows),))]
         return {"inputs": inputs_of(drawn), "targets": task.targets(drawn)}
 
     def evaluate() -> dict[str, float]:
