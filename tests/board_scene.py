@@ -21,11 +21,7 @@ def add_board(spec: mujoco.MjSpec, held: bool, board: Board = BOARD) -> None:
     picture = np.pad(board.draw(_PIXELS_PER_METRE), 8, constant_values=255)
     rows, columns = picture.shape
     texture = spec.add_texture(
-        name="board",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        width=columns,
-        height=rows,
-        nchannel=3,
+        name="board", type=mujoco.mjtTexture.mjTEXTURE_2D, width=columns, height=rows, nchannel=3
     )
     texture.data = np.repeat(picture[..., None], 3, axis=2).tobytes()
     material = spec.add_material(name="board", specular=0.0, shininess=0.0)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from interrupted_training import killed_in_epoch
 from toy_towers import PaintTowers, TogetherTowers
 
 from touchgoal.encoders.alignment.align import AlignedBatch, align, batch_losses
@@ -136,22 +135,6 @@ def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
     text = encoder.embed_text_goal(["a hard round ball", "a soft woven cloth"], PaintTowers())
     ball = encoder.embed_frames(touches.frames[1:2], touches.background[0])
     assert (ball @ text[0]).item() > (ball @ text[1]).item() + 0.2
-
-
-def test_killed_and_resumed_is_bit_identical(tmp_path: Path) -> None:
-    run_align(TRAIN, VAL, CONFIG, tmp_path / "whole")
-    with killed_in_epoch(1):
-        run_align(TRAIN, VAL, CONFIG, tmp_path / "parts")
-    go_on = TrainerOptions(resume=True)
-    run_align(TRAIN, VAL, CONFIG, tmp_path / "parts", go_on)
-    runs = [tmp_path / "whole" / "checkpoint.pt", tmp_path / "parts" / "checkpoint.pt"]
-    whole, parts = (torch.load(path, weights_only=True)["model"] for path in runs)
-    assert all(torch.equal(weight, parts[name]) for name, weight in whole.items())
-    for name in ("metrics.jsonl", "encoder/encoder.safetensors", "encoder/encoder.json"):
-        assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    # as many of the same objects
-    with pytest.raises(UserError, match=r"of another data set.*\(data"):
-        run_align(make_touches(12, seed=5), VAL, CONFIG, tmp_path / "parts", go_on)
 
 
 def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> None:

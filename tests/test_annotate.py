@@ -182,9 +182,7 @@ def test_annotations_become_touches_that_align_trains_on(annotated: tuple, tmp_p
     assert (tmp_path / "run" / "encoder").is_dir()
 
 
-def test_command_with_real_classes(
-    twenty: Set, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_the_real_classes(twenty: Set, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Random weights: the detector finds boxes anywhere, the captioner answers anything."""
     pytest.importorskip("transformers")
     detector = str(make_detector(tmp_path / "detector"))

@@ -8,7 +8,6 @@ import pytest
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.safety.limits import TASK_FORCES
-from touchgoal.control.tactile.contact import THRESHOLD, contact_strength
 from touchgoal.episodes.recording import run
 from touchgoal.sim_envs.bead_maze import BeadMaze, add_bead_on_wire, add_wire
 from touchgoal.sim_envs.config import BeadMazeConfig
@@ -119,19 +118,6 @@ def test_it_takes_touch(maze: BeadMaze) -> None:
         assert max(tick[ft.TRUTH_PROGRESS] for tick in ticks) < 0.6
 
 
-def test_the_hand_closes_while_a_fixture_holds_the_bead(maze: BeadMaze) -> None:
-    env = BeadMaze(BeadMazeConfig(max_seconds=2.0, disturbance=0.004))
-    observation, info = env.reset(seed=3, options={"wire": "roller-3"})
-    untouched = observation
-    assert not info[ft.TRUTH_CONTACT].any()
-    ticks = list(run(env, BeadMazeExpert(env), observation, info))
-    for key in ft.TACTILE:
-        before, after = contact_strength(np.stack([ticks[0][key], ticks[12][key]]), untouched[key])
-        assert before < THRESHOLD < after
-    np.testing.assert_array_equal(ticks[0][ft.STATE][:7].round(3), ticks[9][ft.STATE][:7].round(3))
-    assert ticks[30][ft.TRUTH_PROGRESS] > 0 and not ticks[30][ft.TRUTH_FAILURE].any()
-
-
 def test_drop_and_jam(maze: BeadMaze) -> None:
     maze.reset(seed=0)
     terminated, info = False, {}
@@ -142,17 +128,3 @@ def test_drop_and_jam(maze: BeadMaze) -> None:
     env.reset(seed=0)
     *_, info = [env.step(STILL) for _ in range(22)][-1]
     assert info[ft.TRUTH_FAILURE].tolist() == [False, True, False]
-
-
-def test_bead_stays_on_the_wire_whatever_the_hand_does(maze: BeadMaze) -> None:
-    maze.reset(seed=0)
-    maze.action_space.seed(0)
-    pressed = False
-    for _ in range(40):
-        action = maze.action_space.sample()
-        action[7] = 0.0
-        *_, info = maze.step(action)
-        pressed |= info[ft.TRUTH_FAILURE][2]
-        point, _ = maze.wire.at(maze.wire.project(maze.object_pose()[:3], maze.arc_length))
-        assert np.linalg.norm(maze.object_pose()[:3] - point) < 2e-3
-    assert pressed

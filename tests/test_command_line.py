@@ -205,9 +205,7 @@ def test_an_unfit_surrounding_is_one_line(tmp_path: Path, shell: str, message: s
     assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("touchgoal ")
 
 
-def test_a_full_disk_is_one_line_with_the_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_names_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from touchgoal.launch import list as command
 
     def save(_: object) -> None:

@@ -17,10 +17,8 @@ from touchgoal.control.arms import franka, ur
 from touchgoal.control.arms.streaming import ArmConfig, ArmProcess, shift_wrench
 from touchgoal.control.cell.connection import _gripper, connect_arm
 from touchgoal.control.cell.limits import cell_limits
-from touchgoal.control.interfaces import Arm, Camera, DriverError, Gripper, LoadCell
+from touchgoal.control.interfaces import Arm, DriverError, Gripper
 from touchgoal.control.safety.limits import FR3, UR5E
-from touchgoal.control.sensors.load_cell import SerialLoadCell
-from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.runtime.errors import UserError
 
 pytestmark = pytest.mark.realtime
@@ -205,21 +203,6 @@ def test_a_gripper_opens_closes_and_is_clipped_to_its_stroke(twin: Twin) -> None
     assert gripper.read().fault == "" and gripper.read().stamp > stamp
     gripper.stop()
     gripper.close()
-
-
-def test_a_camera_and_a_load_cell_give_fresh_readings(twin: Twin) -> None:
-    address = twin.cell.cameras["front"].source
-    camera = VideoCamera(VideoConfig(address, rate=10.0, frozen_after=np.inf))
-    first = camera.read()
-    until(lambda: camera.read().stamp > first.stamp + 0.3)
-    assert isinstance(camera, Camera) and first.image.dtype == np.uint8
-    camera.close()
-    assert twin.cell.load_cell is not None
-    cell = SerialLoadCell(twin.cell.load_cell)
-    reading = cell.read()
-    assert isinstance(cell, LoadCell) and abs(reading.force) < 5
-    until(lambda: cell.read().stamp > reading.stamp)
-    cell.close()
 
 
 def test_a_taken_franka_is_said_and_not_waited_for(twin: Twin) -> None:

@@ -55,9 +55,7 @@ def embedder() -> EpisodeEmbedder:
     return EpisodeEmbedder(towers, encoder)
 
 
-def test_goals_from_a_picture_and_from_another_episode(
-    embedder: EpisodeEmbedder, tmp_path: Path
-) -> None:
+def test_goals_from_pictures_and_other_episodes(embedder: EpisodeEmbedder, tmp_path: Path) -> None:
     writer = EpisodeWriter(tmp_path / "set")
     writer.append(recorded(color=160))
     writer.append(recorded())

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
-from toy_episodes import FPS, assert_holds, make_episode, record
+from toy_episodes import FPS, assert_holds, make_episode, moving_blob, record
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.format import set_files
@@ -35,18 +35,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_round_trip(recorded: Path) -> None:
     assert validate(recorded) == []
     assert_holds(recorded, [0, 1, 2], n=70)
-
-
-def test_part_of_an_episode_is_that_part_of_the_whole(recorded: Path) -> None:
-    episodes, rng = EpisodeSet(recorded), np.random.default_rng(0)
-    whole = episodes.read(1)
-    for size in (0, 1, 2, 9, 70):
-        frames = rng.integers(0, 70, size)
-        keys = rng.permutation(list(episodes.features))[:5].tolist()
-        part = episodes.read(1, keys, frames.tolist())
-        assert list(part.frames) == keys
-        for key in keys:
-            np.testing.assert_array_equal(part.frames[key], whole.frames[key][frames])
 
 
 def test_files_are_what_lerobot_reads(recorded: Path) -> None:
@@ -225,17 +213,12 @@ def test_checksum_tells_sets_apart(recorded_small: Path, small: Path) -> None:
     assert EpisodeSet(small.with_name("other")).checksum != checksum, "as many, other frames"
 
 
-def moving_ramp(n: int, height: int, width: int) -> np.ndarray:
-    i, y, x = np.mgrid[:n, :height, :width]
-    return np.stack([60 + 2 * x + 3 * i, 40 + 4 * y, 200 - 2 * x], axis=-1).astype(np.uint8)
-
-
 def test_video_and_folder_give_the_same_frames(tmp_path: Path) -> None:
-    frames = moving_ramp(12, 32, 48)
+    frames = moving_blob(12, 32, 48, 0)
     write_video(tmp_path / "clips" / "a.mp4", frames, 12.5)
     read, fps = read_frames(tmp_path / "clips" / "a.mp4")
     assert fps == 12.5 and read.shape == frames.shape
-    assert np.abs(read - frames.astype(int)).max() < 12
+    assert np.abs(read - frames.astype(int)).mean() < 4
     folder = tmp_path / "pictures"
     folder.mkdir()
     for i, frame in enumerate(frames):

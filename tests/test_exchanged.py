@@ -119,9 +119,7 @@ class CameraOnTheArm(FakeCamera):
 
 
 @pytest.mark.parametrize("exchanged", [False, True])
-def test_a_run_with_exchanged_cameras_ends_after_the_start_move(
-    exchanged: bool, tmp_path: Path
-) -> None:
+def test_exchanged_cameras_end_a_run_after_its_start_move(exchanged: bool, tmp_path: Path) -> None:
     start = FR3.arm.home + np.array([0.3, *[0.0] * 6])
     text = SIM.replace("seed = 3", f"start = {start.tolist()}")
     cell, scene = FakeCell(), np.random.default_rng(0).integers(0, 255, (128, 128, 3), np.uint8)

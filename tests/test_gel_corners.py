@@ -9,7 +9,6 @@ from fake_cell import SIM, write_cell_file
 
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.connection import _tactile_camera
-from touchgoal.control.sensors.fingertip_source import recorded_frames
 from touchgoal.control.sensors.tactile_camera import NO_CROP, fingertip_view, rectify
 from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
 from touchgoal.runtime.errors import UserError
@@ -69,13 +68,6 @@ def test_corners_of_no_gel_are_refused() -> None:
     }.items():
         with pytest.raises(UserError, match=says):
             rectify(np.zeros((480, 640, 3), np.uint8), SHAPE, corners)
-
-
-def test_recordings_of_a_wedge_are_rectified(tmp_path: Path) -> None:
-    picture, corners = seen_at_an_angle(1.0)
-    cv2.imwrite(str(tmp_path / "0.png"), picture)
-    (frame,) = recorded_frames(tmp_path, GELSIGHT_WEDGE, corners)
-    np.testing.assert_array_equal(frame, rectify(picture, SHAPE, corners))
 
 
 def test_a_wedges_camera_needs_its_corners() -> None:

@@ -127,18 +127,14 @@ SEQUENCES = {  # widths that are asked for, and the commands that they make
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
-def test_driver_and_environment_send_these_commands(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_driver_and_environment_send_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     (wanted, expected), between = SEQUENCES[name], 0.04 if name.startswith("a ") else 0.0
     widths, commands = driven(monkeypatch, wanted, between)
     assert commands == expected
     np.testing.assert_array_equal(simulated(wanted, between), widths)
 
 
-def test_driver_and_environment_do_the_same_whatever_is_asked(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_driver_and_environment_agree_whatever_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     for _ in range(30):
         widths = rng.choice([0.0, 0.001, 0.01, 0.03, 0.05, OPEN, 0.2], 12)

@@ -72,9 +72,7 @@ def test_the_commands_push_and_pull_an_encoder(hub: HubServer, tmp_path: Path) -
     load_encoder(tmp_path / "lab/surfaces")
 
 
-def test_a_policy_keeps_its_parts_and_a_later_push_what_it_holds(
-    hub: HubServer, tmp_path: Path
-) -> None:
+def test_a_policy_keeps_its_parts_and_a_later_push_its_own(hub: HubServer, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(POLICY, run / "policy")
     (run / "policy" / "README.md").write_text("my own card")
@@ -92,7 +90,7 @@ def test_a_policy_keeps_its_parts_and_a_later_push_what_it_holds(
     assert ".gitattributes" in hub.repositories["lab/picker"]  # none of our files
 
 
-def test_every_refusal_is_one_line(
+def test_refusals_in_a_line(
     hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("HF_TOKEN", raising=False)
@@ -112,9 +110,7 @@ def test_every_refusal_is_one_line(
         pass
 
 
-def test_other_peoples_files_are_refused_and_no_code_is_downloaded(
-    hub: HubServer, tmp_path: Path
-) -> None:
+def test_others_files_are_refused_and_no_code_is_fetched(hub: HubServer, tmp_path: Path) -> None:
     push(ENCODER, "lab/model", False, api(hub))
     sound = dict(hub.repositories["lab/model"])
     other = json.dumps(json.loads(sound["config.json"]) | {"model_type": "bert"}).encode()

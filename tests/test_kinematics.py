@@ -50,9 +50,7 @@ def near_tasks(
         yield q, np.clip(q + rng.uniform(-NEAR, NEAR, q.size), lower, upper)
 
 
-def check_against_mujoco(
-    model: "mujoco.MjModel", arm: Kinematics, site: str, dofs: list[int]
-) -> None:
+def against_mujoco(model: "mujoco.MjModel", arm: Kinematics, site: str, dofs: list[int]) -> None:
     """Position, rotation and Jacobian to 1e-9 at random joint positions over the whole range."""
     import mujoco  # after touchgoal, which chooses the OpenGL platform
 
@@ -78,16 +76,7 @@ def test_fr3_matches_mujoco() -> None:
     spec.body("hand").quat = np.array([np.cos(np.pi / 8), 0, 0, -np.sin(np.pi / 8)])
     model = spec.compile()
     dofs = [int(model.joint(f"fr3_joint{i}").dofadr[0]) for i in range(1, 8)]
-    check_against_mujoco(model, Fr3Kinematics(), "tcp", dofs)
-
-
-def test_at_a_singularity_the_joints_change_little() -> None:
-    """A UR5e with its wrist stretched, asked for what no change of its joints gives."""
-    arm = UR5E
-    stretched = arm.arm.home * [1, 1, 1, 1, 0, 1] + [0, 0, 0, 0, 1e-6, 0]
-    lost = np.linalg.svd(arm.jacobian(stretched))[0][:, -1]  # direction of the least displacement
-    assert np.abs(np.linalg.pinv(arm.jacobian(stretched)) @ (1e-3 * lost)).max() > 100
-    assert np.abs(arm.joint_change(stretched, 1e-3 * lost)).max() < 1
+    against_mujoco(model, Fr3Kinematics(), "tcp", dofs)
 
 
 def test_out_of_reach_is_said() -> None:
@@ -126,14 +115,12 @@ def test_the_simulated_ur5e_is_the_makers() -> None:
     assert model.site("tcp").pos[2] == pytest.approx(0.0108 + 0.1628 - 0.01875)
     assert 2 * model.joint("finger_joint1").range[1] == pytest.approx(0.085)
     dofs = [int(model.joint(f"ur5e_joint{i}").dofadr[0]) for i in range(1, 7)]
-    check_against_mujoco(model, UR5E, "tcp", dofs)
+    against_mujoco(model, UR5E, "tcp", dofs)
 
 
 @pytest.mark.parametrize("posture", [0.02, 0.0])
 @BOTH_ARMS
-def test_near_poses_are_reached_near_limits_and_singularities_too(
-    arm: Kinematics, posture: float
-) -> None:
+def test_near_poses_are_reached_at_singularities_too(arm: Kinematics, posture: float) -> None:
     """99 % of poses from 0.2 rad off; what is called reached is there, and near."""
     limits, reached = arm.arm.limits, 0
     for q, start in near_tasks(arm, POSES, np.random.default_rng(3)):

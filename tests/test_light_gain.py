@@ -24,7 +24,6 @@ from touchgoal.control.tactile.picture_guard import explain
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, SensorModel, find_sensor
 from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.policies.checkpoint import load_policy
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
@@ -135,19 +134,6 @@ def test_the_background_follows_the_light_and_still_reports_it() -> None:
     for _ in range(50):
         still.update(lit(rest, np.full(3, 1.04)))
     assert not still.drift().large
-
-
-@pytest.mark.parametrize("name", ["bead-maze", "bead-maze-wrench"])
-def test_shipped_policies_embed_a_touch_alike_in_another_light(name: str) -> None:
-    embedder = load_policy(name).touch
-    assert embedder is not None
-    sensor = find_sensor(embedder.sensor or "gelsight_mini")
-    rest, touched, _ = touches(sensor, 2)
-    first, now, dimmed = (
-        {str(key): frame for key in ft.TACTILE} for frame in (rest, touched, lit(touched, DIM))
-    )
-    steady, other, untouched = (embedder.embed_tick([tick], first) for tick in (now, dimmed, first))
-    assert np.linalg.norm(other - steady) < 0.05 * np.linalg.norm(steady - untouched)
 
 
 def test_the_environment_changes_the_light_after_the_first_picture() -> None:

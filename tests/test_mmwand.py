@@ -11,11 +11,9 @@ import torch
 from in_process import in_process_workers
 
 from touchgoal.benchmarks.papers.mmwand import classification, retrieval
-from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet
 from touchgoal.benchmarks.papers.mmwand.real import dome_set, dome_tables, zero_shot
-from touchgoal.benchmarks.papers.mmwand.retrieval import PUBLISHED, judge
 from touchgoal.control import features as ft
-from touchgoal.encoders.alignment.splits import SPLITS, Fold, split_touches
+from touchgoal.encoders.alignment.splits import SPLITS, split_touches
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers
@@ -38,8 +36,6 @@ from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
 
-OBJECTS, TOUCHES = 10, 200
-
 
 def press_objects(root: Path, sensor: str, seed: int) -> Path:
     with pytest.MonkeyPatch.context() as patch, in_process_workers():
@@ -53,58 +49,21 @@ def wand(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return press_objects(tmp_path_factory.mktemp("wand") / "episodes", "gelsight_mini", 0)
 
 
-def made_up(seed: int = 0) -> EmbeddedSet:
-    """Each object has a direction of its own in every modality, beside noise."""
-    rng = np.random.default_rng(seed)
-    label, owner = np.arange(TOUCHES) % OBJECTS, np.repeat(np.arange(OBJECTS), 4)
-
-    def embeddings(of: np.ndarray, width: int) -> np.ndarray:
-        places = rng.normal(size=(OBJECTS, width))
-        return (places[of] + 0.3 * rng.normal(size=(len(of), width))).astype(np.float32)
-
-    return EmbeddedSet(
-        names=tuple("abcdefghij"),
-        sensor="gelsight_mini",
-        label=label,
-        visit=np.arange(TOUCHES) // 5,
-        sentences=tuple(map(str, range(len(owner)))),
-        describes=owner == np.arange(OBJECTS)[:, None],
-        texts=embeddings(owner, 24),
-        image=embeddings(label, 32)[:, None],
-        touch={"touch": embeddings(label, 16)},
-        pixels=embeddings(label, 8),
-    )
-
-
 @pytest.mark.parametrize("split", SPLITS)
 def test_a_split_holds_out_what_it_says(split) -> None:
-    data = made_up()
-    drawn = data.label, data.visit, data.describes, 1
-    fold, again = split_touches(split, *drawn), split_touches(split, *drawn)
+    label, visit = np.arange(200) % 10, np.arange(200) // 5
+    describes = np.repeat(np.arange(10), 4) == np.arange(10)[:, None]
+    fold, again = (split_touches(split, label, visit, describes, 1) for _ in range(2))
     assert not set(fold.train) & set(fold.test) and (fold.test == again.test).all()
-    assert 0.1 < len(fold.test) / TOUCHES < 0.3
+    assert 0.1 < len(fold.test) / 200 < 0.3
     if split == "object":
-        assert not set(data.label[fold.train]) & set(data.label[fold.test])
+        assert not set(label[fold.train]) & set(label[fold.test])
     if split == "press":
-        assert not set(data.visit[fold.train]) & set(data.visit[fold.test])
+        assert not set(visit[fold.train]) & set(visit[fold.test])
     if split in ("object", "sentence"):
         assert not (fold.train_text & fold.test_text).any()
     if split == "sentence":
-        assert (data.describes[:, fold.test_text].sum(1) == 1).all()
-
-
-def test_retrieval_knows_the_right_answer_and_chance() -> None:
-    data = made_up()
-    every = Fold(np.arange(0), np.arange(TOUCHES), np.ones(40, bool), np.ones(40, bool))
-    one_hot = np.eye(OBJECTS)
-    known = {"touch": one_hot[data.label], "image": one_hot[data.label]}
-    known["text"] = one_hot[data.describes.argmax(0)]
-    blind = {name: np.zeros_like(rows) for name, rows in known.items()}
-    assert judge(data, every, known).keys() == PUBLISHED.keys()
-    for _, precision in judge(data, every, known).values():
-        assert precision.mean() == pytest.approx(1)
-    for direction, (_, precision) in judge(data, every, blind).items():
-        assert 0.1 < precision.mean() < 0.19, direction
+        assert (describes[:, fold.test_text].sum(1) == 1).all()
 
 
 def test_a_surface_is_called_what_it_is() -> None:
@@ -174,18 +133,6 @@ def test_the_benchmarks_run(
         }
 
 
-def test_touches_of_another_sensor_choose_among_sentences(
-    wand: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    other = press_objects(tmp_path / "episodes", "gelsight", 1)
-    command = f"benchmark zero-shot --data {other} --other {wand} --seeds 3 --heads.epochs 2"
-    command += f" --cache {wand.parent / 'cache'} --out {tmp_path / 'run'}"
-    assert main(command.split()) in (0, None)
-    assert "trained on gelsight_mini" in capsys.readouterr().out
-    row = json.loads((tmp_path / "run/metrics.json").read_text())["rows"][0]
-    assert row["seen top-1"][0] <= row["seen top-5"][0]
-
-
 # ---- published sets
 
 
@@ -244,9 +191,7 @@ def test_the_dome_set_is_read(dome: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("split", dome_tables.SPLITS)
-def test_every_row_is_tested_once_and_never_trained_on(
-    dome: Path, split: dome_set.DomeSplit
-) -> None:
+def test_every_row_is_tested_once_never_trained_on(dome: Path, split: dome_set.DomeSplit) -> None:
     data = read_vt60(dome)
     found = list(dome_set.folds(data, split, 0))
     tested = np.concatenate([fold.test_touch for fold in found])

@@ -71,7 +71,7 @@ def test_a_gel_that_is_touched_first_is_waited_for(session: list[np.ndarray]) ->
     assert recorder.hint == "press at the top, left"
 
 
-def test_record_presses_writes_what_calibrate_reads(
+def test_record_presses_writes_what_is_calibrated(
     session: list[np.ndarray], tmp_path: Path
 ) -> None:
     """A folder of pictures; then a second ball is added."""

@@ -2,7 +2,6 @@
 
 import os
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +20,12 @@ from published_files import (
     write_slides,
 )
 
-from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.encoders.pretrained import ENCODER_FORMAT, load_encoder
-from touchgoal.encoders.ssl.frames import sample_recordings
 from touchgoal.episodes.importers.feeling_of_success import read_grasps
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
 from touchgoal.episodes.importers.tacbench_forces import read_strokes
 from touchgoal.episodes.importers.tacbench_poses import read_bags
 from touchgoal.episodes.importers.touch_clip import TouchClip, read_pictures
-from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
 
 
@@ -72,32 +67,6 @@ def test_touch_and_go_has_red_and_blue_put_back(tmp_path: Path) -> None:
     assert [r.held_out for r in recordings] == [True, False, False, False]  # the shortest quarter
     assert near(recordings[2].open()[0].frames([4])[0], gel(4, (480, 640)))
     assert read_recordings(tmp_path, "gelsight")[0].sensor == "gelsight"
-
-
-def test_touches_are_drawn_with_those_before_them(tmp_path: Path) -> None:
-    write_slides(tmp_path, ("mug",))
-    recordings = read_recordings(tmp_path)[1:3]
-    preprocess = preprocessor_for("digit")
-    drawn = sample_recordings(recordings, 100, 0, (0, 5))
-    assert drawn.touch.shape == (9 + 10, 2, 3, 160, 120) and drawn.stride == 5
-    clip, background = recordings[1].open()
-    for row, past in ((0, 0), (4, 0), (9, 4)):
-        expected = preprocess(clip.frames([row, past]), background)
-        assert np.allclose(drawn.touch[9 + row], expected, atol=2e-3)
-    alone = sample_recordings(recordings, 3, 0)
-    assert alone.touch.shape == (6, 3, 160, 120)
-    assert np.array_equal(alone.touch[:3], sample_recordings(recordings[:1], 3, 0).touch)
-
-
-def test_an_encoder_learns_from_a_published_folder(tmp_path: Path) -> None:
-    data, out = tmp_path / "slides", tmp_path / "run"
-    write_slides(data)
-    toy = "--frames 4 --mae.vit tiny --mae.epochs 1 --mae.batch-size 8".split()
-    main(["train-encoder", "mae", "--data", str(data), "--out", str(out), *toy])
-    encoder = load_encoder(str(out / "encoder"))
-    assert encoder.embed(np.stack([gel(1), gel(2)])).shape[0] == 2  # upright, as a DIGIT's
-    recipe = ENCODER_FORMAT.provenance(out / "encoder")
-    assert recipe["data"]["train"] == [{"path": data.name, "recordings": 8, "held_out": 2}]
 
 
 def test_what_is_no_such_folder_is_one_line(tmp_path: Path) -> None:
@@ -203,31 +172,6 @@ def test_grasps_are_held_or_not_and_felt_by_two_fingers(tmp_path: Path) -> None:
     write(tmp_path / "030.pkl", value | {"is_gripping": [True, False]})
     with pytest.raises(UserError, match="of different lengths"):
         list(read_grasps(tmp_path))
-
-
-@pytest.mark.parametrize("read", [read_strokes, read_bags, read_grasps])
-def test_whatever_byte_is_wrong_labels_are_read_or_refused(tmp_path: Path, read: Callable) -> None:
-    if read is read_strokes:
-        write_force_batch(tmp_path / "sphere" / "batch_1")
-    elif read is read_bags:
-        write_pose_set(tmp_path, bags=1)
-    else:
-        write_grasps(tmp_path / "000.pkl", [True, False])
-    assert list(read(tmp_path))
-    path = max(tmp_path.rglob("*.pkl"))  # of force batches the last one holds the labels
-    data, rng = path.read_bytes(), np.random.default_rng(2)
-    pictures = [at for at in range(len(data)) if data[at : at + 3] == b"\xff\xd8\xff"]
-    # Of a file of pictures the bytes about them and at its end count, where the labels are.
-    labels = [at + k for at in pictures for k in range(-12, 4)] + list(range(len(data)))[-1500:]
-    for at in rng.permutation(labels)[:150]:
-        broken = bytearray(data)
-        broken[at] ^= int(rng.integers(1, 256))
-        path.write_bytes(broken)
-        try:
-            for item in read(tmp_path):
-                assert str(item.name).encode()  # what a terminal can show
-        except UserError as refused:
-            assert "\n" not in str(refused)
 
 
 VALUE = {

@@ -31,9 +31,7 @@ def cluster() -> Iterator[Any]:
         cluster.shutdown()
 
 
-def test_a_lost_node_changes_no_bit(
-    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_node_may_be_lost(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     local, on_ray, append = tmp_path / "local", tmp_path / "ray", EpisodeWriter.append
     with in_process_workers():
         main([*DEMOS.split(), "--out", str(local)])

@@ -12,7 +12,6 @@ from touchgoal.benchmarks.real_touch import forces, markers
 from touchgoal.benchmarks.real_touch.embedders import find_embedder
 from touchgoal.benchmarks.real_touch.forces import EmbeddedGrasp, cost_table, judge_cost
 from touchgoal.benchmarks.real_touch.videos import Config, run
-from touchgoal.control.tactile.force import calibrate_force, change_statistics, resized
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes import property_probe
@@ -138,35 +137,9 @@ def test_properties_of_unseen_objects_are_predicted() -> None:
     ranks = np.stack([objects % 3, (objects // 3) % 3], 1)
     embeddings = np.eye(3)[ranks].reshape(120, 6) + 0.2 * rng.normal(size=(120, 6))
     predicted = property_probe.predict_properties(embeddings, ranks, objects)
-    right = predicted.ranks == ranks
-    assert right.mean() > 0.95
-    assert property_probe.pair_accuracy(predicted.ranks[:, 0], ranks[:, 0], objects) > 0.9
-    assert property_probe.most_of_three(predicted.scores[:, 0], ranks[:, 0], objects, rng) > 0.95
-    all_right = np.asarray(right.all(1))
-    low, high = property_probe.interval(all_right, objects)
-    assert low <= all_right.mean() <= high
+    assert (predicted.ranks == ranks).mean() > 0.95
     shuffled = property_probe.predict_properties(rng.normal(size=(120, 6)), ranks, objects)
     assert (shuffled.ranks == ranks).mean() < 0.45  # chance, for no strength is chosen on them
-
-
-def test_force_is_read_of_another_object() -> None:
-    """Calibrated on blocks that press wider with force, read on narrower ones."""
-
-    def grasp(width: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        rng = np.random.default_rng(seed)
-        force = np.concatenate([np.zeros(10), np.linspace(0, 20, 40)])
-        rows = []
-        background = np.full((60, 80, 3), 100, np.float32)
-        for newton in force:
-            bump = 4 * newton * np.exp(-((X - 40) ** 2 + (Y - 30) ** 2) / (2 * width**2))
-            frame = background + bump[..., None] * [1, -1, 0.5] + rng.normal(0, 1, (60, 80, 3))
-            rows.append(change_statistics(frame.clip(0, 255).astype(np.uint8), resized(background)))
-        return np.stack(rows), force
-
-    known = [grasp(width, i) for i, width in enumerate((3.0, 5.0))]
-    reader = calibrate_force(*(np.concatenate(part) for part in zip(*known, strict=True)))
-    rows, force = grasp(4.0, 9)
-    assert np.median(np.abs(reader.predict(rows) - force)) < 1.5
 
 
 def test_the_cost_falls_with_the_touch_and_tells_the_wrong_object() -> None:

@@ -15,7 +15,6 @@ import pytest
 from fake_cell import write_cell_file
 
 from touchgoal.control import features as ft
-from touchgoal.control.deployment.scripted import PickPlacePoses
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_vector
@@ -24,7 +23,6 @@ from touchgoal.control.safety.limits import FR3
 from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import HandMotion, Verdict
 from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
-from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
 from touchgoal.control.teleoperation.teleoperator import Teleoperator
 from touchgoal.episodes.store import EpisodeSet
@@ -234,25 +232,3 @@ def test_recording_needs_a_person(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(SystemExit, match="nobody is there to lead the arm"):
         run("record-demos", cell, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_the_script_picks_places_and_says_how_it_ended() -> None:
-    """In free space, with a hand that goes where it is asked and closes on 40 mm."""
-    position, width = np.array([0.4, 0.1, 0.3]), 0.08
-    device = ScriptedDevice(PickPlacePoses((0.5, 0.0, 0.03, 0.0), (0.5, -0.1)))
-    closed_at = None
-    for _ in range(1000):
-        state = np.zeros(15, np.float32)
-        state[-1] = width
-        pose = np.array([*position, 0.0, 1.0, 0.0, 0.0], np.float32)  # fingers down
-        motion = device.read({ft.TCP_POSE: pose, ft.STATE: state})
-        assert np.abs(motion.twist).max() <= 1
-        position = position + 0.1 * TICK * motion.twist[:3]
-        width = max(0.04, width - 0.01) if motion.gripper == "close" else 0.08
-        if closed_at is None and width == 0.04:
-            closed_at = position.copy()
-        if device.verdict:
-            break
-    assert device.verdict == "done" and closed_at is not None
-    np.testing.assert_allclose(closed_at, [0.5, 0.0, 0.03], atol=0.005)
-    np.testing.assert_allclose(position, [0.5, -0.1, 0.03], atol=0.005)

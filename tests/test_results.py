@@ -36,14 +36,6 @@ def test_a_record_is_complete_and_printed_by_its_benchmark(name: str, capsys) ->
     assert all(line in printed for line in record["printed"])
 
 
-def test_a_measured_record_has_the_schema_of_all(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(records, "FOLDER", tmp_path)
-    metrics = {"successes": 1, "trials": 2, "hardware": "2 cores"}
-    records.write_record("pick-place", QUOTED["pick-place"].command, ["a table"], metrics)
-    assert list(records.load_record("pick-place")) == SCHEMA
-    assert records.headline("pick-place").startswith("1/2 [")
-
-
 @pytest.mark.parametrize("task", ["pick-place", "bead-maze"])
 def test_no_two_recordings_share_a_seed(task: str) -> None:
     """A shared seed would be skipped without a word."""

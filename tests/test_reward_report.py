@@ -82,9 +82,7 @@ def test_an_interrupted_measurement_goes_on_to_the_same_files(
     assert "episode_001.png" not in whole
 
 
-def test_another_picture_under_the_name_of_the_goal_is_measured_anew(
-    episodes: Path, tmp_path: Path
-) -> None:
+def test_another_goal_under_the_same_name_is_measured_anew(episodes: Path, tmp_path: Path) -> None:
     picture, out = tmp_path / "goal.png", tmp_path / "out"
     model = replace(MODEL, goal=Goal(image=GoalPicture(picture)))
     ends = []
@@ -95,9 +93,7 @@ def test_another_picture_under_the_name_of_the_goal_is_measured_anew(
     assert ends[0] != ends[1]
 
 
-def test_videos_are_found_by_what_their_names_show(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_videos_are_found_by_their_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """NAME.mp4 with others beside it, folders with front.mp4, and one that is broken."""
     folder = tmp_path / "lab"
     front, touch = EPISODE.frames[FRONT], EPISODE.frames[TACTILE_LEFT]

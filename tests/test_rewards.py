@@ -8,16 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from touchgoal.control.features import TACTILE_LEFT, TACTILE_RIGHT
-from touchgoal.rewards.curves import (
-    Contact,
-    Curves,
-    add_fused_curves,
-    potential_reward,
-    state_reward,
-)
+from touchgoal.rewards.curves import Contact, Curves, potential_reward, state_reward
 from touchgoal.rewards.distance.embedding_distance import compute_curves, compute_distances
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer as fit
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
@@ -143,19 +136,6 @@ def replace_text(normalizer: DistanceNormalizer) -> DistanceNormalizer:
     )
 
 
-def test_own_ends_and_those_of_others_have_their_own_medians() -> None:
-    """The five frames before the last lie at 8 8 4 2 2 and at 40 degrees, the goals at 0, 40."""
-    still = replace(embedded("a"), image=direction([90.0] * 34 + [8.0, 8.0, 4.0, 2.0, 2.0, 0.0]))
-    turned = replace(embedded("b"), image=direction([90.0] * 30 + [40.0] * 10))
-    normalizer = fit_scene([still, turned], ["image"])
-
-    def median(*degrees: float) -> object:
-        return pytest.approx(np.median(1 - np.cos(np.radians(degrees))), abs=1e-6)
-
-    assert normalizer.start == {"image": median(50, 90), "image (same episode)": median(90, 50)}
-    assert normalizer.goal == {"image": median(36, 40), "image (same episode)": median(4, 0)}
-
-
 def test_touch_goals_are_ends_with_the_same_object() -> None:
     apple = embedded("apple")
     assert apple.touch is not None
@@ -200,31 +180,6 @@ def test_a_normalizer_of_other_embeddings_is_refused(what: str) -> None:
         compute_curves(other, goal_of(good), normalizer)
 
 
-def test_an_episode_that_never_touches_stays_away_from_the_goal() -> None:
-    """The picture ends at the goal, the touch does not; its own last frame as goal would hide that."""
-    training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
-    normalizer = replace_text(fit_scene(training, ["image", "tactile"]))
-    miss = embedded("never touches", touches=False, jitter=1.0)
-    other = compute_curves(miss, goal_of(training[0]), normalizer).metrics()
-    assert other["image"].end < 0.1
-    assert other["tactile"].end > 0.9 and other["tactile"].t_drop_50 is None
-    assert other["image+tactile"].end > 0.4
-    assert compute_curves(miss, goal_of(miss), normalizer).metrics()["image+tactile"].end < 0.1
-
-
-def test_a_modality_with_a_larger_range_does_not_win() -> None:
-    falling, flat = np.linspace(1, 0, 30), np.ones(30)
-    fused = add_fused_curves({"image": falling, "text": flat})
-    assert list(fused) == ["image", "text", "image+text"]
-    assert fused["image+text"] == pytest.approx((falling + 1) / 2)
-    raw_ranges = DistanceNormalizer(
-        {"image": 0.3, "tactile": 1.9}, {"image": 0.2, "tactile": 0.1}, {}, {}, MADE, "", 1
-    )
-    raw = {"image": 0.2 + 0.1 * falling, "tactile": 0.1 + 1.8 * falling[::-1]}
-    both = add_fused_curves(raw_ranges.normalise(raw, MADE, frozenset()))
-    assert both["image+tactile"] == pytest.approx(np.full(30, 0.5))
-
-
 def test_rewards_by_hand() -> None:
     cost = np.array([1.0, 0.4, 0.6, 0.0])
     assert state_reward(cost) == pytest.approx([-1.0, -0.4, -0.6, 0.0])
@@ -251,8 +206,6 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
     normalised = {"image": fall, "tactile": fall**2}
     curves = Curves("a $ path$ #3", goal, 20.0, Contact(12, "truth"), raw, normalised)
     paths = write_report(curves, tmp_path / "out", "ep3", {"encoder": "tiny"}, gamma=0.9)
-    with Image.open(paths["png"]) as picture:
-        assert picture.size == (1200, 1000)
     with paths["csv"].open() as file:
         rows = list(csv.DictReader(file))
     shaping = potential_reward(fall, 0.9 ** (1 / 20))
@@ -266,10 +219,6 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
         assert [float(r[column]) for r in rows] == pytest.approx(expected, abs=1e-6), column
     content = json.loads(paths["json"].read_text())
     assert content["potential_reward"]["gamma"] == 0.9
-    assert content["potential_reward"]["values"]["image"] == pytest.approx(shaping, abs=1e-6)
-    assert content["metrics"]["tactile"]["contact_lag"] == curves.metrics()["tactile"].contact_lag
     assert content["provenance"] == {"encoder": "tiny"} and content["contact"]["frame"] == 12
-    names = sorted(p.name for p in (tmp_path / "out").iterdir())
-    assert names == ["ep3.csv", "ep3.json", "ep3.png"]
     first = paths["png"].read_bytes()
     assert write_report(curves, tmp_path, "ep3", {}, gamma=0.9)["png"].read_bytes() == first

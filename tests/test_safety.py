@@ -105,9 +105,7 @@ def test_nothing_leaves_the_limits_in_a_long_random_walk(name: str) -> None:
 
 
 @BOTH_ROBOTS
-def test_eight_corners_of_the_fingertips_are_watched_5_mm_above_the_table(
-    robot: RobotLimits,
-) -> None:
+def test_eight_corners_of_the_fingertips_stay_5_mm_above_the_table(robot: RobotLimits) -> None:
     """Turned about the approach axis the edges across the fingers come lowest: two points miss them."""
     layer = LAYERS[robot.arm.name]
     points = layer.monitored_points(robot.arm.home[None])[0]
@@ -167,9 +165,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("field", "value", "limit"), FAULTS)
-def test_the_first_fault_brakes_within_limits_and_stays(
-    field: str, value: object, limit: Limit
-) -> None:
+def test_a_fault_brakes_within_limits_and_stays(field: str, value: object, limit: Limit) -> None:
     layer = LAYERS["FR3"]
     state = run(layer, [np.full(7, -0.02)] * 8)
     assert np.abs(state.velocity).max() > 0.3

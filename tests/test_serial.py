@@ -4,7 +4,6 @@ import os
 import random
 import struct
 import threading
-import time
 import tty
 from collections.abc import Iterator
 
@@ -57,18 +56,6 @@ def damage(message: bytes, rng: random.Random) -> bytes:
         for i in where[: 1 if kind == 2 else 4]:
             damaged[i] ^= 1 << rng.randrange(8)
     return bytes(damaged)
-
-
-def test_a_load_cell_is_read_in_newtons(line: tuple[int, str]) -> None:
-    device, port = line
-    cell = SerialLoadCell(LoadCellConfig(port, newtons_per_count=0.01, zero=1000.0, max_force=50.0))
-    before = time.monotonic()
-    for k in range(6):
-        os.write(device, counted(k))
-    until(lambda: cell.read().force == pytest.approx(0.05))
-    reading = cell.read()
-    assert reading.rejected == 0 and before < reading.stamp < time.monotonic()
-    cell.close()
 
 
 @pytest.mark.parametrize(("checksum", "believed"), [("none", 6436), ("xor", 145), ("crc16", 0)])

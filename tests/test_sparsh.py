@@ -30,9 +30,7 @@ TOY = ViTConfig((32, 48), width=48, depth=2, heads=2, mlp_ratio=2.0)
     ("method", "parameters"),
     [("mae", 86_254_848), ("dino", 86_255_616), ("ijepa", 86_386_944), ("vjepa", 86_537_472)],
 )
-def test_the_published_models_have_the_published_number_of_parameters(
-    method: str, parameters: int
-) -> None:
+def test_models_have_the_published_number_of_parameters(method: str, parameters: int) -> None:
     with torch.device("meta"):
         vit = ViT(SPARSH_BASE[method])
     assert sum(parameter.numel() for parameter in vit.parameters()) == parameters

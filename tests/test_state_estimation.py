@@ -17,14 +17,12 @@ from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig
 from touchgoal.policies.perception.placements import Placements, render_placements
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
 from touchgoal.policies.perception.pose_training import pose_errors, train_pose_estimator
-from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.perception.state_estimation import ESTIMATED, StateEstimator
 from touchgoal.policies.perception.target_words import Look, embed, sentence
 from touchgoal.policies.training.dagger import DaggerRoles
 from touchgoal.runtime import seeds
 from touchgoal.sim_envs.config import PickPlaceConfig
-from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
-from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace
+from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE
 
 CROPS = ((ft.FRONT, (0, 32, 0, 32)),)
@@ -36,22 +34,6 @@ SMALL = PoseEstimatorConfig(
 def toy_estimator() -> StateEstimator:
     torch.manual_seed(0)
     return StateEstimator(PoseEstimator(SMALL).eval())
-
-
-def test_the_start_is_seen_from_the_hand() -> None:
-    columns = ft.TCP_POSE, ft.TRUTH_CONTACT, ft.TRUTH_START
-    yaw, hand = 0.4, 0.3
-    pose = [0.5, 0.1, 0.2, 0.0, np.cos(hand / 2), np.sin(hand / 2), 0.0]  # fingers down
-    start = [0.45, 0.15, 0.03, np.cos(2 * yaw), np.sin(2 * yaw), 0.6, -0.1]
-    left = 2 * (yaw - hand)
-    for contact in ([0.0, 1.0], [1.0, 1.0]):  # the object matters, or the goal
-        held = contact == [1.0, 1.0]
-        row = torch.tensor([pose + contact + start])
-        observed = network_input(row, columns, "base_twist")[0, 11:].numpy()
-        way = np.array([0.0, 0.0, -0.17, 0.1, -0.2] if held else [-0.05, 0.05, -0.17, 0.0, 0.0])
-        twice = [0.0, 0.0] if held else [np.cos(left), np.sin(left)]
-        expected = [*way, *twice, *way / (np.abs(way) + 0.02)]
-        np.testing.assert_allclose(observed, expected, atol=1e-6)
 
 
 SPOTS = {"red": (255, 0, 0), "blue": (0, 0, 255)}  # the objects; the goal is green
@@ -91,17 +73,19 @@ def test_contact_is_the_simulators_in_every_tick() -> None:
     assert not estimator.estimate(again, again)[ft.TRUTH_CONTACT].any()
 
 
-def train_pose(count: int, epochs: int, out: Path) -> tuple[Placements, PoseEstimator]:
+def train_pose(
+    count: int, epochs: int, out: Path, options: TrainerOptions
+) -> tuple[Placements, PoseEstimator]:
     """Train a small estimator on bright spots; return the spots, too."""
     torch.manual_seed(0)
     placements, sight = spots(count), PoseEstimator(SMALL)
     config = PoseTrainConfig(epochs=epochs, lr=1e-2)
-    train_pose_estimator(sight, placements, config, out, TrainerOptions(), {})
+    train_pose_estimator(sight, placements, config, out, options, {})
     return placements, sight
 
 
 def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
-    placements, sight = train_pose(256, 60, tmp_path)
+    placements, sight = train_pose(256, 60, tmp_path, TrainerOptions())
     errors = pose_errors(sight, placements)
     assert errors["0 others"]["object_mm"][0] < 15 and errors["1 others"]["found"] > 0.9
     rows = placements.objects == 2
@@ -141,20 +125,6 @@ SEES = (ft.STATE, ft.TCP_POSE, *ESTIMATED)
 ESTIMATING = replace(TOY, touch_dim=0, touch="", proprioception=SEES, position_noise=0.0)
 
 
-def test_a_rearrangement_is_a_beginning() -> None:
-    env = PickPlace(PickPlaceConfig(cameras=(), tactile=False))
-    _, first = env.reset(seed=3, options={"object": "wooden_block"})
-    observation, info = env.rearrange()
-    start, (low, high) = info[ft.TRUTH_START], np.array(WORKSPACE).T
-    assert not np.allclose(start, first[ft.TRUTH_START])
-    np.testing.assert_allclose(start[:3], info[ft.TRUTH_OBJECT_POSE][:3], atol=1e-6)
-    for place in (start[:2], start[5:]):
-        assert (low - 0.01 < place).all() and (place < high + 0.01).all()
-    twice = 2 * env.grasp_yaw()
-    np.testing.assert_allclose(start[3:5], [np.cos(twice), np.sin(twice)], atol=1e-6)
-    assert np.linalg.norm(observation[ft.TCP_POSE][:3] - [0.45, 0, 0.26]) < 0.06
-
-
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
 JOB = EpisodeSpec(1, options={"object": "wooden_block"})
 
@@ -165,22 +135,6 @@ def test_it_picks_and_places_though_it_is_led_astray(disturbance: float) -> None
     assert episode.meta["success"]
     moved = np.abs(episode.frames[ft.ACTION][:, :7])
     assert moved.max() < 0.1  # rad a tick, 2 rad/s: an FR3 may turn its slowest joint as fast
-
-
-def test_it_gives_way_to_what_it_presses_on() -> None:
-    env = PickPlace(BLIND)
-    observation, _ = env.reset(seed=JOB.seed, options=JOB.options)
-    expert, forces = FeedbackExpert(env), []
-    for tick in range(160):
-        action = expert.act(observation)
-        if tick < 50:  # somebody else presses the closed hand on the table
-            down = env.kinematics.joint_change(env.command, np.array([0, 0, -0.008, 0, 0, 0]))
-            action = np.append(down if env.external_wrench()[2] < 40 else np.zeros(7), 0.0)
-        elif tick < 60:
-            assert env.kinematics.jacobian(env.command)[2] @ action[:7] > 0 or forces[-1] < 4
-        observation, *_ = env.step(action)
-        forces.append(env.external_wrench()[2])
-    assert max(forces) > 30 and forces[-1] < 10
 
 
 def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:

@@ -5,12 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from touchgoal.control.tactile.sensor_calibration import load, shade
-from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, SensorModel
+from touchgoal.control.tactile.sensor_calibration import shade
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI as MINI
-from touchgoal.sim_envs.config import NO_RANDOMIZATION, PickPlaceConfig
-from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
-from touchgoal.sim_envs.pick_place import PickPlace
+from touchgoal.sim_envs.config import NO_RANDOMIZATION
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
 from touchgoal.sim_envs.tactile.geometry import (
     BOX,
@@ -21,7 +18,7 @@ from touchgoal.sim_envs.tactile.geometry import (
     add_mesh,
     add_primitive,
 )
-from touchgoal.sim_envs.tactile.optics import colour_change, render, render_untouched
+from touchgoal.sim_envs.tactile.optics import render
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, overlap
@@ -162,62 +159,6 @@ def test_degenerate_contacts_stay_finite(at: list[float], half: float) -> None:
         frame = sense(Body(CATALOGUE["brick"], (half, half, half), 0.1), at, force)
         assert np.isfinite(frame.depth).all() and frame.depth.min() > -1e-4
         assert frame.field is not None and np.isfinite(frame.field.wrench()).all()
-
-
-def test_same_seed_same_sensor() -> None:
-    one, again, other = (sample_instance(MINI, np.random.default_rng(s)) for s in (3, 3, 4))
-    for name in ("background", "noise", "illumination"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(again, name))
-    assert (one.background != other.background).mean() > 0.5
-    assert one.pixel_pitch != other.pixel_pitch
-    assert MINI.pitch_range[0] <= other.pixel_pitch <= MINI.pitch_range[1]
-
-
-@pytest.mark.parametrize("sensor", [GELSIGHT, DIGIT], ids=lambda s: s.name)
-@pytest.mark.parametrize("largest_turn", [0.0, 80.0])
-def test_shadows_fall_opposite_the_bright_sides(sensor: SensorModel, largest_turn: float) -> None:
-    """Each light alone on a bump: bright towards the light, shadow behind."""
-    lights = replace(NO_RANDOMIZATION, azimuth=largest_turn)
-    y, x = np.mgrid[:120, :160].astype(np.float32) - np.array([60, 80], np.float32)[:, None, None]
-    bump = 6e-4 * np.exp(-(x**2 + y**2) / (2 * 9**2)).astype(np.float32)
-
-    def direction(change: np.ndarray) -> complex:
-        return complex((change * x).sum(), (change * y).sum())
-
-    for seed in range(4):
-        instance = sample_instance(sensor, np.random.default_rng(seed), lights)
-        calibration = instance.calibration
-        own_shadow = np.diag(np.diag(calibration.shadow))
-        slopes = np.zeros_like(calibration.response)
-        slopes[:, :2] = calibration.response[:, :2]
-        no_shadow = replace(calibration, response=slopes, shadow=np.zeros_like(own_shadow))
-        no_slopes = replace(calibration, response=np.zeros_like(slopes), shadow=own_shadow)
-        bright, dark = (
-            colour_change(bump, replace(instance, calibration=c)) for c in (no_shadow, no_slopes)
-        )
-        for channel in range(3):
-            towards, away = direction(bright[channel]), direction(-dark[channel])
-            assert abs(np.angle(-away / towards, deg=True)) < 20
-
-
-def test_untouched_sensor_shows_only_noise() -> None:
-    rng = np.random.default_rng(0)
-    first, second = (render_untouched(INSTANCE, rng).astype(float) for _ in range(2))
-    noise = load(MINI.sensor_file).noise  # of which the darkest colours lose some, cut off at 0
-    assert 0.7 * noise < (second - first).std() / np.sqrt(2) < 1.1 * noise
-
-
-def test_grasp_shows_on_both_pads_with_the_commanded_force() -> None:
-    env = PickPlace(PickPlaceConfig(cameras=()))
-    env.reset(seed=0, options={"object": "golf_ball", "grasp_force": 10.0})
-    expert = PickPlaceExpert(env)
-    for _ in range(60):
-        env.step(expert.act({}))
-    for frame in env.tactile_frames:
-        assert frame.mask.mean() > 0.05
-        pressed = MINI.foundation_modulus * frame.depth[frame.mask].sum() * MINI.pixel_pitch**2
-        assert pressed == pytest.approx(10.0, rel=0.25)  # the gel's smoothing moves some outside
-    env.close()
 
 
 SMOOTH = np.zeros((TILE, TILE), np.float32)

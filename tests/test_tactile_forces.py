@@ -11,7 +11,6 @@ from touchgoal.sim_envs.tactile.forces import ForceField, force_field
 from touchgoal.sim_envs.tactile.geometry import NO_SURFACE, Grid
 from touchgoal.sim_envs.tactile.markers import GelMotion, layer_compliance
 from touchgoal.sim_envs.tactile.press import press_until_balanced
-from touchgoal.sim_envs.tactile.shear_relief import ShearRelief
 
 GRID = Grid(88, 108, 4 * MINI.pixel_pitch)
 Y, X = (
@@ -195,17 +194,3 @@ def test_pressed_gel_spreads_outwards_and_little_under_the_object() -> None:
     assert abs(x[0]) < 1e-6 and x[2] > 0.03e-3 and x[2] > 3 * x[1] > 0 and x[2] > 1.5 * x[3] > 0
     turned = GelMotion(MINI, GRID, points[:, ::-1])(field)
     np.testing.assert_allclose(turned[:, 1], x, rtol=0.02, atol=1e-6)
-
-
-def test_the_gel_piles_up_in_front_of_what_is_drawn_over_it() -> None:
-    field = feel(ball(radius=0.01), wrench(5.0), wrench(5.0, shear=(2.0, 0.0)), friction=0.5)
-    relief = ShearRelief(MINI, GRID, GRID)
-    sinks = relief.depth(field)
-    x = (np.arange(sinks.shape[1]) - (sinks.shape[1] - 1) / 2) * field.pitch
-    front, behind = (sinks[:, (sign * x > 1e-3) & (sign * x < 5e-3)] for sign in (1, -1))
-    assert front.mean() < 0 < behind.mean()
-    assert 5e-6 < behind.max() < 60e-6 and abs(sinks.sum()) < 0.02 * np.abs(sinks).sum()
-    still = relief.depth(replace(field, tangential=0 * field.tangential))
-    np.testing.assert_allclose(still, 0, atol=1e-12)
-    held = relief(field, np.ones((GRID.rows, GRID.columns), np.float32))
-    assert not held.any()

@@ -92,9 +92,7 @@ def test_image_tower_recognises_a_photo(offline: OfflineTowers, photo: np.ndarra
     assert logits.argmax(1).item() == IMAGENET_MILITARY_UNIFORM
 
 
-def test_image_embedding_does_not_depend_on_the_batch(
-    offline: OfflineTowers, photo: np.ndarray
-) -> None:
+def test_images_embed_alike_in_any_batch(offline: OfflineTowers, photo: np.ndarray) -> None:
     crops = np.stack([photo[i * 60 : i * 60 + 128, 100:260] for i in range(4)])
     together = offline.embed_images(crops)
     assert together.shape == (4, 1280) and not together.requires_grad

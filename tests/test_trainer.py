@@ -13,18 +13,17 @@ import pytest
 import torch
 from torch import nn
 
-from touchgoal.encoders.backbones.vit import ViT, ViTConfig
-from touchgoal.encoders.ssl.config import MaeConfig
-from touchgoal.encoders.ssl.mae import MaskedAutoencoder
 from touchgoal.encoders.ssl.train import train_unlabelled
+from touchgoal.encoders.training import trainer
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, parameter_groups
+from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.launch import train_encoder
 from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.training.train import train
 from touchgoal.runtime.errors import UserError
 
+FRESH = TrainerOptions()
 OPTIMIZER = OptimizerConfig(epochs=2, batch_size=4, lr=1e-2, weight_decay=0.0)
 
 
@@ -43,24 +42,6 @@ def line() -> Training:
     torch.manual_seed(0)
     data = torch.randn(8, 3)
     return Training(Line(), 8, lambda rows, _: {"x": data[rows]}, OPTIMIZER, {"data": "line"})
-
-
-def test_biases_norms_and_tokens_do_not_decay() -> None:
-    for module, kept in (
-        (ViT(ViTConfig(width=16, depth=1, heads=2, class_token=True)), "class_token"),
-        (MaskedAutoencoder(MaeConfig(vit="tiny", bottleneck=False), "gelsight_mini"), "mask_token"),
-    ):
-        names = {id(parameter): name for name, parameter in module.named_parameters()}
-        decayed, others = parameter_groups(module, 0.05)
-        assert decayed["weight_decay"] == 0.05 and others["weight_decay"] == 0.0
-        for group, matrices in ((decayed, True), (others, False)):
-            for parameter in group["params"]:
-                name = names.pop(id(parameter))
-                layer = module.get_submodule(name.rpartition(".")[0])
-                assert isinstance(layer, nn.Linear | nn.Conv2d) >= matrices, name
-                assert name.endswith("weight") or not matrices, name
-        assert not names, "every parameter is in one group"
-        assert any(p is getattr(module, kept) for p in others["params"])
 
 
 def test_tensorboard_lies_beside_the_metrics_and_resuming_is_recorded(tmp_path: Path) -> None:
@@ -95,7 +76,9 @@ test_trainer.train_everything(Path(sys.argv[1]))
 """
 
 
-def trainings() -> dict[str, Callable[[Path], object]]:
+def trainings(
+    options: TrainerOptions = FRESH, seed: int = 0
+) -> dict[str, Callable[[Path], object]]:
     """Every trainer at toy size, two epochs of a few steps each, given a folder."""
     import test_align
     import test_self_supervision
@@ -103,33 +86,32 @@ def trainings() -> dict[str, Callable[[Path], object]]:
     import toy_policies
     from toy_touches import moving_blobs
 
-    fresh: tuple[TrainerOptions, dict] = TrainerOptions(), {}
     short = {"epochs": 2, "lr": 0.1, "batch_size": 8}
     unlabelled = {
-        "mae": (test_self_supervision.blobs(16, 0), test_self_supervision.MAE),
-        "dino": (moving_blobs(16), replace(test_self_supervision.DINO, batch_norm=True)),
-        "ijepa": (moving_blobs(16), test_self_supervision.IJEPA),
-        "vjepa": (moving_blobs(16, frames=4), test_self_supervision.VJEPA),
+        "mae": (test_self_supervision.blobs(16, seed), test_self_supervision.MAE),
+        "dino": (moving_blobs(16, seed), replace(test_self_supervision.DINO, batch_norm=True)),
+        "ijepa": (moving_blobs(16, seed), test_self_supervision.IJEPA),
+        "vjepa": (moving_blobs(16, seed, frames=4), test_self_supervision.VJEPA),
     }
 
     def without_labels(name: str, out: Path) -> None:
         touch, config = unlabelled[name]
-        train_unlabelled(touch, touch, replace(config, **short), out, *fresh)
+        train_unlabelled(touch, touch, replace(config, **short), out, options, {})
 
     def policy(head: Any, out: Path) -> None:
         config = replace(toy_policies.TOY, head=head)
-        windows = toy_policies.toy_dataset(config)
-        train(config, windows, windows, TrainConfig(epochs=2, batch_size=8), out, *fresh)
+        windows = toy_policies.toy_dataset(config, seed=seed)
+        train(config, windows, windows, TrainConfig(epochs=2, batch_size=8), out, options, {})
 
     align = replace(test_align.CONFIG, epochs=2, lr=0.1)
-    touches = test_align.TRAIN, test_align.VAL
+    touches = test_align.make_touches(12, seed), test_align.VAL
     return {
         **{name: partial(without_labels, name) for name in unlabelled},
-        "align": lambda out: test_align.run_align(*touches, align, out),
+        "align": lambda out: test_align.run_align(*touches, align, out, options),
         "diffusion": partial(policy, toy_policies.DIFFUSION),
         "flow": partial(policy, toy_policies.FLOW),
         "regression": partial(policy, MLPConfig(width=16)),
-        "pose": lambda out: test_state_estimation.train_pose(64, 2, out),
+        "pose": lambda out: test_state_estimation.train_pose(64 + seed, 2, out, options),
     }
 
 
@@ -140,6 +122,30 @@ def test_fits_in_closed_form_refuse_torchrun(monkeypatch: pytest.MonkeyPatch) ->
 
 
 TRAINERS = "mae dino ijepa vjepa align diffusion flow regression pose".split()
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_a_killed_training_ends_with_the_same_weights(name: str, tmp_path: Path) -> None:
+    train_epoch: Callable = trainer._train_epoch
+
+    def killed(*arguments: Any) -> object:
+        if arguments[-1] == 1:
+            raise KeyboardInterrupt
+        return train_epoch(*arguments)
+
+    trainings()[name](tmp_path / "whole")
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(trainer, "_train_epoch", killed)
+        trainings()[name](tmp_path / "killed")
+    go_on = TrainerOptions(resume=True)
+    with pytest.raises(UserError, match=r"of another data set.*\(data"):
+        trainings(go_on, seed=1)[name](tmp_path / "killed")
+    trainings(go_on)[name](tmp_path / "killed")
+    folders = [tmp_path / "whole", tmp_path / "killed"]
+    whole, resumed = (torch.load(f / "checkpoint.pt", weights_only=True)["model"] for f in folders)
+    assert all(torch.equal(weight, resumed[key]) for key, weight in whole.items())
+    lines = [(folder / "metrics.jsonl").read_text() for folder in folders]
+    assert lines[0] == lines[1]
 
 
 def train_everything(out: Path) -> None:

@@ -48,9 +48,7 @@ def at_1_khz(move: Trajectory) -> np.ndarray:
 
 
 @BOTH
-def test_full_speed_joint_moves_use_a_limit_up_and_exceed_none(
-    robot: RobotLimits, arm: Kinematics
-) -> None:
+def test_joint_moves_use_a_limit_up_and_exceed_none(robot: RobotLimits, arm: Kinematics) -> None:
     limits, rng = robot.interface, np.random.default_rng(0)
     q = arm.arm.home
     for _ in range(40):
@@ -78,12 +76,6 @@ def test_retreats_are_straight_and_within_limits(robot: RobotLimits, arm: Kinema
         assert np.linalg.norm(np.cross(points - points[0], along), axis=1).max() < 1e-4
         np.testing.assert_allclose(points[-1], high, atol=1e-6)
         np.testing.assert_allclose(poses[-1][1], rotation, atol=1e-6)
-
-
-def test_a_move_to_the_same_place_stays() -> None:
-    home = robots.FR3.arm.home
-    move = joint_move(home, home, robots.FR3.policy)
-    np.testing.assert_allclose(move.sample(1000), np.tile(home, (len(move.sample(1000)), 1)))
 
 
 def test_what_cannot_be_done_is_refused_in_a_line() -> None:

@@ -13,10 +13,8 @@ from toy_policies import TOY, toy_observations
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.realtime import RealTimeActor
-from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, TouchBackboneConfig
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS, ViTConfig
-from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.encoders.pretrained import load_encoder, save
 from touchgoal.encoders.ssl.unlabelled_touch import open_touch
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.overlap import require_no_shared_frames
@@ -129,31 +127,6 @@ CLIP = replace(PRESETS["tiny"], width=48, tubelet=2, frames=4)
 def backbone(vit: ViTConfig) -> TouchBackbone:
     torch.manual_seed(0)
     return TouchBackbone(TouchBackboneConfig.for_sensor(vit, "gelsight_mini", STRIDE)).eval()
-
-
-def pictures(n: int) -> np.ndarray:
-    return np.random.default_rng(0).integers(80, 120, (n, 6, 8, 3), np.uint8)
-
-
-@torch.no_grad()
-def by_hand(encoder: TouchBackbone, frames: np.ndarray, i: int) -> np.ndarray:
-    """Embed frame i with its past, newest first; the first frame stands for those before it."""
-    preprocess, clip = preprocessor_for("gelsight_mini"), encoder.config.vit.tubelet > 1
-    seen = [preprocess(frames[max(i - STRIDE * k, 0)][None], frames[0])[0] for k in range(4)]
-    touch = np.stack(seen, 1) if clip else np.concatenate(seen[:2])
-    return encoder.vit(torch.from_numpy(touch)[None])[0].mean(0).numpy()
-
-
-@pytest.mark.parametrize("vit", [PAIR, CLIP], ids=["two frames", "clip of four"])
-def test_recorded_frames_are_embedded_with_their_past(vit: ViTConfig, tmp_path: Path) -> None:
-    encoder, frames = backbone(vit), pictures(BATCH + 4)
-    found = encoder.embed_frames(frames, frames[0])
-    for i in (0, 2, 5, BATCH - 1, BATCH, BATCH + 3):
-        np.testing.assert_allclose(found[i], by_hand(encoder, frames, i), atol=1e-5)
-    some = encoder.embed_frames(frames, frames[0], np.array([40, 7, 7]))
-    np.testing.assert_allclose(some, found[[40, 7, 7]], atol=1e-5)
-    save(encoder, tmp_path, {}, half=False)
-    np.testing.assert_allclose(load_encoder(tmp_path).embed(frames), found, atol=1e-5)
 
 
 @pytest.mark.parametrize("vit", [PRESETS["tiny"], PAIR, CLIP], ids=["one", "two", "clip"])

@@ -77,9 +77,7 @@ def camera(streamer: Streamer) -> Iterator[VideoCamera]:
     camera.close()
 
 
-def test_a_slow_reader_of_a_stream_sees_the_present(
-    streamer: Streamer, camera: VideoCamera
-) -> None:
+def test_a_slow_reader_sees_the_present(streamer: Streamer, camera: VideoCamera) -> None:
     assert camera.read().image.shape == (96, 128, 3)
     time.sleep(1.0)
     frame = camera.read()
@@ -122,9 +120,7 @@ def test_pictures_cut_in_half_are_refused_and_said(streamer: Streamer, camera: V
     until(lambda: camera.read().sequence > last.sequence and camera.problem == "")
 
 
-def test_another_size_in_mid_run_is_refused_and_said(
-    streamer: Streamer, camera: VideoCamera
-) -> None:
+def test_another_size_in_a_run_is_refused_and_said(streamer: Streamer, camera: VideoCamera) -> None:
     until(lambda: camera.problem == "")
     streamer.shape = (192, 256)
     until(lambda: "256x192 pixels instead of 128x96" in camera.problem)
@@ -170,9 +166,7 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
     [(GELSIGHT_MINI, "mini_presses/ball*.png"), (GELSIGHT_MINI_MARKERS, "mini_markers/*.png")],
     ids=["plain", "dots"],
 )
-def test_broken_jpegs_are_refused_and_presses_and_moving_dots_are_not(
-    model: SensorModel, real: str
-) -> None:
+def test_broken_jpegs_are_refused_and_real_changes_are_not(model: SensorModel, real: str) -> None:
     """Random bytes; decoders show them as blocks, which read as millimetres of indentation."""
     clips = [[noisy(k, model) for k in range(30)]]
     found = [cv2.imread(str(path)) for path in sorted(REAL.glob(real))]
@@ -308,9 +302,7 @@ class PluggedCamera:
     def release(self) -> None: ...
 
 
-def test_after_a_replug_the_serial_number_is_looked_up_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_after_a_replug_the_serial_number_is_looked_up(monkeypatch: pytest.MonkeyPatch) -> None:
     asked, devices = [], iter(["/dev/video2", "/dev/video4", *["/dev/video6"] * 99])
 
     def opened(source: str, _: int) -> PluggedCamera:

@@ -3,7 +3,7 @@
     python tests/interop/emulators.py [NAME ...]      NAME: franka-sim, franky-sim; none: both
 
 Each runs in `.venv-interop` (`make interop` makes it), in real time; franka-sim aborts what breaks the FCI's
-motion limits. Clients that are not ours (franky, ur-rtde) drive the twin in test_twin_clients.py.
+motion limits. Clients that are not ours (franky, ur-rtde) drive the twin in test_twin.py.
 """
 
 import os

@@ -1,14 +1,17 @@
-"""The twin's controllers through their makers' clients: libfranka (franky) and ur-rtde."""
+"""The twin over the wire: its controllers by their makers' clients, its load cell, its control port."""
 
+import socket
 import time
 from typing import Any
 
 import numpy as np
 import pytest
+import serial
 from running_twin import RunningTwin, client
 
-from touchgoal.control.safety.limits import FR3
-from touchgoal.sim_envs.twin.franka.limits import Setpoint, joint_fault
+from touchgoal.control.sensors.load_cell import parse
+from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.twin.mjpeg import Stream
 
 HOME = [0.0, -0.3, 0.0, -2.2, 0.0, 1.9, 0.785]
 
@@ -66,9 +69,6 @@ def moves(address: str, home: list[float]) -> dict:
     settle()
     fell = pose - np.array(robot.state.O_T_EE.translation)
     robot.move(franky.JointMotion(home))
-    before = np.array(robot.state.q)
-    robot.move(franky.JointVelocityMotion([0.2, 0, 0, 0, 0, 0, 0], franky.Duration(300)))
-    turned = np.array(robot.state.q) - before
     held = np.inf
     stiffness = np.array([600, 600, 600, 600, 250, 150, 50.0])
     with franky.JointImpedanceTracker(robot, stiffness=stiffness) as tracker:
@@ -76,8 +76,7 @@ def moves(address: str, home: list[float]) -> dict:
         settle(0.5)
         held = float(np.abs(np.array(robot.state.q) - home).max())
     far = refused(np.array([2.9, *home[1:]]))
-    ways = {"fell": fell.tolist(), "turned": turned.tolist()}
-    return {"panda": panda, "far": far, "errors": errors, "held": held, **ways}
+    return {"panda": panda, "far": far, "errors": errors, "held": held, "fell": fell.tolist()}
 
 
 @pytest.mark.realtime
@@ -88,33 +87,16 @@ def test_franka_holds_clients_to_its_limits(fr3: RunningTwin) -> None:
     assert "joint_motion_generator_" in result["far"] and "limits_violation" in result["far"]
     assert max(result["errors"]) < 2e-3
     np.testing.assert_allclose(result["fell"], [0, 0, 0.03], atol=2e-3)
-    assert 0.05 < result["turned"][0] < 0.07 and np.abs(result["turned"][1:]).max() < 3e-3
     assert result["held"] < 0.02
     worst = fr3.ask("truth")["worst"]
     assert worst["excess"] <= 0 and worst["speed"] < 1
-
-
-@pytest.mark.parametrize("joint", range(7))
-@pytest.mark.parametrize("end", [0, 1])
-def test_speeds_are_refused_above_the_range_of_their_place(joint: int, end: int) -> None:
-    limits, zero = FR3.hardware, np.zeros(7)
-    for share in np.linspace(0.02, 0.98, 25):  # near the ends of the range less is allowed
-        q = FR3.arm.home.copy()
-        q[joint] = limits.lower[joint] + share * (limits.upper - limits.lower)[joint]
-        speed = limits.speed_range(q)[end][joint]
-        for factor, fault in ((1.005, None), (1.02, "velocity_limits_violation")):
-            dq = zero.copy()
-            dq[joint] = factor * speed + (2e-3 * np.sign(speed) if fault else 0.0)
-            found = joint_fault(Setpoint(q, dq, zero), Setpoint(q, dq, zero), cartesian=False)
-            if abs(speed) > 0.01:
-                assert found == (fault and f"joint_motion_generator_{fault}"), (share, factor)
 
 
 # ---- UR
 
 
 def drives(address: str) -> dict:
-    """Moves, stops, servoes at three rates, and falls silent."""
+    """Moves, servoes at three rates, and falls silent."""
     from rtde_control import RTDEControlInterface
     from rtde_receive import RTDEReceiveInterface
 
@@ -127,13 +109,6 @@ def drives(address: str) -> dict:
     result: dict[str, Any] = {}
     control.moveJ((start + 0.2).tolist(), 1.0, 2.0)
     result["move"] = float(np.abs(at() - start - 0.2).max())
-    control.moveJ((start - 0.4).tolist(), 0.5, 2.0, True)
-    time.sleep(0.4)
-    control.stopJ(5.0)
-    stopped = at()
-    time.sleep(0.2)
-    result["stop"] = float(np.abs(at() - stopped).max())
-    result["short"] = float(np.abs(at() - start + 0.4).max())
     control.moveJ(start.tolist(), 1.0, 2.0)
     result["servo"] = []
     for rate in (20, 125, 500):
@@ -163,9 +138,71 @@ def drives(address: str) -> dict:
 @pytest.mark.realtime
 def test_ur_moves_servoes_and_watches(ur5e: RunningTwin) -> None:
     result = client(drives, ur5e.cell.address)
-    assert result["move"] < 2e-3 and result["stop"] < 2e-3 and result["short"] > 0.1
+    assert result["move"] < 2e-3
     for taken, worst in result["servo"]:
         assert taken and worst < 0.1  # rad behind a goal at 0.2 rad/s, on a loaded machine
     np.testing.assert_allclose(result["line"], [0, 0, -0.05], atol=2e-3)
     assert result["kicked"] and not result["silent"]
     assert ur5e.ask("truth")["worst"]["excess"] <= 0
+
+
+# ---- its devices and its control port
+
+
+def test_load_cell_weighs_is_garbled_and_unplugged(fr3: RunningTwin) -> None:
+    fr3.begin('reset 3 {"object": "wooden_block", "mass": 0.1}')
+    config = fr3.cell.load_cell
+    assert config is not None
+
+    def readings(n: int) -> list[float | None]:
+        device.reset_input_buffer()
+        device.readline()
+        samples = [parse(device.readline().strip(), config) for _ in range(n)]
+        return [sample.force if sample else None for sample in samples]
+
+    with serial.Serial(config.port, 115200, timeout=2) as device:
+        weights = [reading for reading in readings(20) if reading is not None]
+        assert len(weights) == 20 and abs(np.median(weights) - 0.981) < 0.02
+        fr3.ask("garble load_cell 0.5")
+        assert 3 < readings(20).count(None) < 18
+        fr3.ask("garble load_cell 0")
+        fr3.ask("unplug load_cell")
+        with pytest.raises(serial.SerialException):
+            for _ in range(100):
+                device.readline()
+    fr3.ask("plug load_cell")
+    with serial.Serial(config.port, 115200, timeout=2) as device:
+        assert None not in readings(5)
+
+
+def test_web_pages_and_nonsense_change_nothing_at_the_control_port(fr3: RunningTwin) -> None:
+    token, _, where = fr3.cell.task.twin.rpartition("@")
+    host, _, number = where.rpartition(":")
+    for stranger in ("kill", "x kill", f"{token[:-1]} kill"):
+        with socket.create_connection((host, int(number)), timeout=5) as other:
+            other.sendall(f"{stranger}\n".encode())
+            assert b"token" in other.recv(100) and other.recv(100) == b""
+    with socket.create_connection((host, int(number)), timeout=5) as page:
+        body = f"stop-button on\n{token} nudge 0 400 0 5\n{token} kill\n"
+        page.sendall(
+            f"POST / HTTP/1.1\r\nHost: {where}\r\nOrigin: http://a.example\r\n"
+            f"Content-Type: text/plain\r\nContent-Length: {len(body)}\r\n\r\n{body}".encode()
+        )
+        assert page.recv(100) == b""
+    rng = np.random.default_rng(1)
+    numbers = "nudge nan 0 0 1|nudge 1e308 0 0 1|freeze inf|reset -1|reset 99999999999999999999999"
+    words = "stall front", "truth\x00", "reset 1 " + "[" * 100_000, "error " + "x" * 1000
+    noise = (rng.bytes(40).decode("latin-1").replace("\n", "") for _ in range(50))
+    for line in (*numbers.split("|"), *words, *noise):
+        with pytest.raises(UserError):
+            fr3.ask(line)
+    truth = fr3.ask("truth")
+    assert np.isfinite(truth["q"]).all() and truth["rest"] > 0
+
+
+def test_streams_that_have_sent_as_many_pictures_are_told_apart() -> None:
+    """Comparing streams by value ended the rendering process."""
+    streams = [Stream(clients=1) for _ in range(2)]
+    for stream in streams:
+        stream.publish(np.zeros((4, 4, 3), np.uint8))
+    assert streams[1] in streams and streams[1] not in streams[:1]
