@@ -48,10 +48,6 @@ def measure(e: EmbeddedEpisode, to: EmbeddedGoal) -> Curves:
     return Curves(e.source, {}, e.fps, e.contact, costs, {})
 
 
-def shuffled(e: EmbeddedEpisode) -> EmbeddedEpisode:
-    return replace(e, touch=e.touches()[:, RNG.permutation(len(e))])
-
-
 def test_the_verdict_is_yes_where_touch_tells_and_no_where_it_was_shuffled() -> None:
     episodes = [episode(k, success=k % 4 != 3) for k in range(40)]
     goals = [goal(e) for e in episodes]
@@ -64,6 +60,6 @@ def test_the_verdict_is_yes_where_touch_tells_and_no_where_it_was_shuffled() -> 
     assert rows["AUC", "neutral"].high < -0.1
     same = rows["last cost", "mirrored"]  # both fingertips feel the same here
     assert same.low <= 0 <= same.high
-    shuffled_episodes = [shuffled(e) for e in episodes]
-    audit = audit_touch(shuffled_episodes, goals, measure)
+    shuffled = [replace(e, touch=e.touches()[:, RNG.permutation(len(e))]) for e in episodes]
+    audit = audit_touch(shuffled, goals, measure)
     assert not audit.mattered and "no sign that touch mattered" in audit.table

@@ -232,9 +232,7 @@ def test_an_encoder_is_trained_and_validated_on_fit_data(
     assert "was recorded with gelsight_mini, not" in message and not (tmp_path / "out").exists()
 
 
-def test_encoder_speed_prints_every_encoder_beside_its_peer(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_encoder_speed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     pair = replace(PRESETS["tiny"], channels=6)
     backbone = TouchBackbone(TouchBackboneConfig.for_sensor(pair, "gelsight_mini", 2))
     pretrained.save(backbone, tmp_path / "pair", {})

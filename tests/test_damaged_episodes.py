@@ -93,9 +93,7 @@ def test_a_flipped_byte_is_noticed_or_without_effect(small: Path, name: str) -> 
         (ft.WRIST, ft.WRIST.replace("wrist", "wrast"), "unknown feature .*wrast"),
     ],
 )
-def test_values_that_cannot_be_are_named_with_the_repair(
-    small: Path, old: str, new: str, message: str
-) -> None:
+def test_impossible_values_are_named(small: Path, old: str, new: str, message: str) -> None:
     text = (small / set_files.INFO).read_text()
     assert old in text
     (small / set_files.INFO).write_text(text.replace(old, new, 1))

@@ -100,13 +100,6 @@ def test_options_by_name() -> None:
         touchgoal.make("pick-place", randomization={"blurr": 0.0})
 
 
-def test_step_before_reset_says_so() -> None:
-    env = touchgoal.make("pick-place", tactile=False, cameras=())
-    for call in (lambda: env.step(STILL), env.render):
-        with pytest.raises(gym.error.ResetNeeded, match=r"needs an episode; call reset\(\) first"):
-            call()
-
-
 def test_a_forked_worker_refuses_to_render() -> None:
     """In Mesa it would wait for ever if its parent has rendered. Not forked: test_for_rl.py."""
     program = """

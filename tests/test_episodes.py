@@ -186,9 +186,7 @@ def test_a_set_that_lerobot_continued_is_left_as_it_is(small: Path) -> None:
     assert {path: path.read_bytes() for path in small.rglob("*") if path.is_file()} == before
 
 
-def test_the_run_folder_around_a_set_will_do(
-    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_run_folder_will_do(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     shutil.copytree(small, tmp_path / "run" / "episodes")
     assert len(EpisodeSet(tmp_path / "run")) == 3
     assert "taking the episodes in" in capsys.readouterr().err

@@ -1,29 +1,19 @@
-"""Policies that see by cameras: keypoints, feature maps, and the way from recordings to actions."""
+"""Policies that see by cameras: feature maps, and the way from recordings to actions."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from test_commands import refused, run
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.checkpoint import load_policy
 from touchgoal.policies.perception.frozen_images import ImageEmbedder, ImageInputConfig
-from touchgoal.policies.perception.keypoints import keypoints
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 
 pytestmark = pytest.mark.usefixtures("in_process")
-
-
-def test_a_keypoint_lies_where_its_map_is_greatest() -> None:
-    attention, features = torch.zeros(1, 1, 5, 9), torch.rand(1, 2, 5, 9)
-    attention[0, 0, 1, 6] = 50.0
-    x, y, *there = keypoints(attention, features)[0].tolist()
-    assert (x, y) == pytest.approx((0.5, -0.5))  # column 6 of 0 to 8, row 1 of 0 to 4
-    assert there == pytest.approx(features[0, :, 1, 6].tolist())
 
 
 def test_a_tick_embeds_like_its_episode_and_another_size_is_refused() -> None:

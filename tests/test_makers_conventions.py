@@ -129,9 +129,7 @@ def test_ur_signs_frames_and_units(ur5e: RunningTwin) -> None:
 
 
 @pytest.mark.parametrize("name", ["fr3", pytest.param("ur5e", marks=pytest.mark.realtime)])
-def test_drivers_say_what_the_environment_does_to_the_robot(
-    name: str, request: pytest.FixtureRequest
-) -> None:
+def test_drivers_say_what_is_done_to_the_robot(name: str, request: pytest.FixtureRequest) -> None:
     """And a UR's sensor is zeroed at the start, so that what already presses then is not felt."""
     twin: RunningTwin = request.getfixturevalue(name)
     twin.begin("reset 3")

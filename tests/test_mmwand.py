@@ -37,16 +37,13 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
 
 
-def press_objects(root: Path, sensor: str, seed: int) -> Path:
-    with pytest.MonkeyPatch.context() as patch, in_process_workers():
-        patch.setattr(wand_recording, "TOUCHES_A_VISIT", 3)
-        record_touches(root, sensor, seed, 18, 1)
-    return root
-
-
 @pytest.fixture(scope="module")
 def wand(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return press_objects(tmp_path_factory.mktemp("wand") / "episodes", "gelsight_mini", 0)
+    root = tmp_path_factory.mktemp("wand") / "episodes"
+    with pytest.MonkeyPatch.context() as patch, in_process_workers():
+        patch.setattr(wand_recording, "TOUCHES_A_VISIT", 3)
+        record_touches(root, "gelsight_mini", 0, 18, 1)
+    return root
 
 
 @pytest.mark.parametrize("split", SPLITS)

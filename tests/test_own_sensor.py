@@ -1,4 +1,4 @@
-"""Frames of a sensor from any source, presses recorded from them, and the sensor checked."""
+"""Frames of a sensor from any source, presses recorded from them, the sensor checked, wear of its gel."""
 
 import threading
 from contextlib import closing
@@ -15,8 +15,13 @@ from touchgoal.control.calibration.sensor_check import check_sensor
 from touchgoal.control.sensors.fingertip_source import open_frames, recorded_frames
 from touchgoal.control.sensors.live_picture import LivePicture
 from touchgoal.control.tactile.depth import DepthEstimator
+from touchgoal.control.tactile.gel_wear import find_wear
 from touchgoal.control.tactile.sensor_calibration import load, shade
-from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
+from touchgoal.control.tactile.sensor_models import (
+    GELSIGHT_MINI,
+    GELSIGHT_MINI_MARKERS,
+    find_sensor,
+)
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import NO_RANDOMIZATION
@@ -24,7 +29,7 @@ from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
-from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
 BALL = Surface("ball", 4e-3, 1.0, np.zeros((TILE, TILE), np.float32), 1.0)
 RNG = np.random.default_rng(0)
@@ -176,3 +181,56 @@ def test_a_darker_picture_has_a_depth(balls: list[np.ndarray]) -> None:
     estimator = DepthEstimator(load(GELSIGHT_MINI.sensor_file), 8)
     depth = estimator.estimate(np.rint(0.75 * balls[0]).astype(np.uint8), balls[0].astype("f4"))
     assert np.isfinite(depth).all()
+
+
+# ---- wear: a scratch, a hole and dust are seen, noise and light are not
+
+
+def look(instance: SensorInstance, rng: np.random.Generator) -> np.ndarray:
+    picture = render_untouched(instance, rng)
+    draw(picture, instance.markers, instance.marker_radius)
+    return picture
+
+
+def drawn(
+    picture: np.ndarray, kind: str, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw a scratch, a hole in the coating or a dust grain; return the picture and the place (px)."""
+    h, w, _ = picture.shape
+    mask, at = np.zeros((h, w), np.uint8), rng.uniform([0.3 * w, 0.3 * h], [0.7 * w, 0.7 * h])
+    middle = int(at[0]), int(at[1])
+    if kind == "scratched":
+        turn = rng.uniform(0, np.pi)
+        way = 30 * np.array([np.cos(turn), np.sin(turn)])
+        start, end = (at - way).astype(int), (at + way).astype(int)
+        cv2.line(mask, start.tolist(), end.tolist(), 255, 2, cv2.LINE_AA)
+        change = np.full(3, rng.choice([-15.0, 15.0]))
+    elif kind == "torn":
+        axes = int(rng.integers(14, 40)), int(rng.integers(14, 30))
+        cv2.ellipse(mask, middle, axes, rng.uniform(0, 180), 0, 360, 255, -1, cv2.LINE_AA)
+        change = 20 - picture.astype(float)
+    else:
+        cv2.circle(mask, middle, int(rng.integers(2, 5)), 255, -1, cv2.LINE_AA)
+        change = -0.5 * picture
+    share = cv2.GaussianBlur(mask / 255.0, (0, 0), 0.7)[..., None]
+    return np.clip(picture + share * change, 0, 255).astype(np.uint8), at
+
+
+@pytest.mark.parametrize(("name", "gels"), [("gelsight_mini", 20), ("gelsight_mini_markers", 8)])
+def test_wear_is_seen_and_named_and_noise_and_light_are_not(name: str, gels: int) -> None:
+    sensor, rng, named = find_sensor(name), np.random.default_rng(0), 0
+    for gel in range(gels):
+        instance = sample_instance(sensor, np.random.default_rng(gel))
+        first = look(instance, rng)
+        light = rng.uniform(0.95, 1.05, 3)  # of each channel
+        now = np.clip(look(instance, rng) * light, 0, 255).astype(np.uint8)
+        assert find_wear(now, first, sensor) is None
+        for kind in ("torn", "scratched", "dirty"):
+            worn, at = drawn(now, kind, rng)
+            wear = find_wear(worn, first, sensor)
+            if wear is None:  # a grain under a printed dot
+                assert kind == "dirty" and sensor.markers is not None
+                continue
+            np.testing.assert_allclose(wear.place, at * sensor.pixel_pitch, atol=1e-3)
+            named += wear.kind == kind
+    assert named >= 0.9 * 3 * gels

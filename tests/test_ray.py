@@ -51,9 +51,7 @@ def test_a_node_may_be_lost(cluster: Any, tmp_path: Path, monkeypatch: pytest.Mo
     assert EpisodeSet(on_ray / "episodes").checksum == EpisodeSet(local / "episodes").checksum
 
 
-def test_errors_are_those_of_a_local_run(
-    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_errors_are_the_same(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with parallel_map(find_sensor, ["gelsight_mini", "none"], cluster.address) as sensors:
         assert next(sensors) == find_sensor("gelsight_mini")
         with pytest.raises(UserError, match="^none is no sensor"):

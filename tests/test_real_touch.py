@@ -164,7 +164,7 @@ def test_videos_of_other_objects_tell_what_differs_without_meaning() -> None:
     embeddings = np.hstack([kind, rng.normal(5, 10, (120, 2))])
     assert nearest_is_same(embeddings, objects).mean() < 0.6
     assert adapted_nearest_is_same(embeddings, objects).mean() > 0.9
-    shuffled = rng.permutation(objects)  # noobject to learn: no better than chance
+    shuffled = rng.permutation(objects)  # no object to learn: no better than chance
     assert adapted_nearest_is_same(embeddings, shuffled).mean() < 0.15
 
 

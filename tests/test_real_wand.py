@@ -50,18 +50,6 @@ def ramp() -> np.ndarray:
     return touch.clip
 
 
-class Screen(io.StringIO):
-    """The terminal that the person reads."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lines: list[str] = []
-
-    def write(self, text: str) -> int:
-        self.lines += [line for line in text.split("\n") if line]
-        return len(text)
-
-
 class Person(threading.Thread):
     """A wand's devices, and the hand that holds it; `silent` stops the load cell."""
 
@@ -71,7 +59,7 @@ class Person(threading.Thread):
         self.server = StreamServer(self.streams, "127.0.0.1", 0)
         self.port, self.silent = SerialPort(folder / "load_cell"), False
         self.gone, self.interrupt_after = False, ""
-        self.ramp, self.screen, self._rng = ramp, Screen(), np.random.default_rng(0)
+        self.ramp, self.screen, self._rng = ramp, io.StringIO(), np.random.default_rng(0)
         self._force = self._goal = 0.0
         self.file = folder / "wand.toml"
         url = f"http://127.0.0.1:{self.server.port}"
@@ -86,7 +74,7 @@ class Person(threading.Thread):
         tick = 0
         while not self.gone:
             tick += 1
-            self._obey(self.screen.lines[-1] if self.screen.lines else "")
+            self._obey(["", *self.lines][-1])
             force = max(self._force, 0.0)
             pressed = self.ramp[int(np.ceil(force / MAX_FORCE * 5))]
             picture = pressed + self._rng.normal(0, 1, pressed.shape)
@@ -100,6 +88,11 @@ class Person(threading.Thread):
                 self.port.write(with_checksum(b"%d,%d" % (tick, counts), "crc16") + b"\r\n")
             time.sleep(0.02)
 
+    @property
+    def lines(self) -> list[str]:
+        """What stands on the terminal."""
+        return [line for line in self.screen.getvalue().split("\n") if line]
+
     def _obey(self, hint: str) -> None:
         if wanted := re.match(r"press with (\d+) to (\d+) N", hint):
             self._goal = (float(wanted[1]) + float(wanted[2])) / 2 + 0.6
@@ -108,13 +101,13 @@ class Person(threading.Thread):
         step = self._goal / 12 if self._goal else -4.0
         self._force = float(np.clip(self._force + step, 0, self._goal or self._force))
         self._force = self._force if self._goal or self._force > 0.5 else 0.0
-        if self.interrupt_after and any(self.interrupt_after in x for x in self.screen.lines):
+        if self.interrupt_after and any(self.interrupt_after in x for x in self.lines):
             self.interrupt_after = ""
             os.kill(os.getpid(), signal.SIGINT)
 
     def when_asked_to_press(self, act: Callable[[], None]) -> None:
         def wait() -> None:
-            until(lambda: any(line.startswith("press with") for line in self.screen.lines))
+            until(lambda: any(line.startswith("press with") for line in self.lines))
             act()
 
         threading.Thread(target=wait, daemon=True).start()
@@ -168,7 +161,7 @@ def test_three_touches_are_recorded_as_the_twins_and_ctrl_c_loses_nothing(
     assert keys == set(found.features)
     assert all(twin.features[key]["shape"] == found.features[key]["shape"] for key in keys)
 
-    person.screen.lines.clear()
+    person.screen = io.StringIO()
     person.interrupt_after = "recorded 1:"
     collect(person, out, "--object", "mug", "--description", "smooth and hard", "--new-gel")
     more = EpisodeSet(out / "episodes")
@@ -184,7 +177,7 @@ def test_a_lost_camera_is_waited_for(person: Person, tmp_path: Path) -> None:
 
     person.when_asked_to_press(lose)
     collect(person, tmp_path / "run", "--object", "screw", "--episodes", "1")
-    lost = [line for line in person.screen.lines if line.startswith("side_left: ")]
+    lost = [line for line in person.lines if line.startswith("side_left: ")]
     assert lost and "check its cable" in lost[0]
     assert len(EpisodeSet(tmp_path / "run" / "episodes")) == 1
 

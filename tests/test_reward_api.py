@@ -180,9 +180,7 @@ def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
     assert scaled["metrics"]["image"]["start"] == pytest.approx(1, abs=0.2)
 
 
-def test_python_and_command_agree_on_simulated_episodes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_python_and_command_agree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The command normalises by the encoder's normalizer; so does Python when it is named."""
     pytest.importorskip("transformers")
     monkeypatch.chdir(tmp_path)

@@ -233,9 +233,7 @@ def test_a_press_is_read_where_and_how_hard_it_is() -> None:
     assert blind.touching.tolist() == readings.touching.tolist() and blind.force is None
 
 
-def test_ends_are_a_goal_that_is_saved_and_chosen_by_object(
-    successes: list[EmbeddedEpisode], tmp_path: Path
-) -> None:
+def test_ends_are_a_goal_chosen_by_object(successes: list[EmbeddedEpisode], tmp_path: Path) -> None:
     others = [replace(e, object="pear") for e in successes[:2]]
     SuccessfulEnds.of([*successes, *others]).save(tmp_path / "goal.npz")
     ends = SuccessfulEnds.load(tmp_path / "goal.npz")

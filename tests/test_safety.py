@@ -214,9 +214,7 @@ def test_no_start_outside(robot: RobotLimits) -> None:
 
 
 @given(st.floats(width=64))
-def test_the_gripper_is_asked_for_widths_inside_its_stroke_and_kept_while_the_arm_holds(
-    target: float,
-) -> None:
+def test_the_gripper_keeps_to_its_stroke_and_holds_with_the_arm(target: float) -> None:
     layer = LAYERS["FR3"]
     start = layer.start(layer.limits.arm.home)
     moving = layer.filter_action(start, np.zeros(7), reading(start.q))

@@ -31,11 +31,6 @@ SMALL = PoseEstimatorConfig(
 )
 
 
-def toy_estimator() -> StateEstimator:
-    torch.manual_seed(0)
-    return StateEstimator(PoseEstimator(SMALL).eval())
-
-
 SPOTS = {"red": (255, 0, 0), "blue": (0, 0, 255)}  # the objects; the goal is green
 
 
@@ -63,7 +58,7 @@ def spots(count: int) -> Placements:
 def test_contact_is_the_simulators_in_every_tick() -> None:
     env = PickPlace(PickPlaceConfig(camera_size=(32, 32), cameras=("front",)))
     episode = record_episode(env, EpisodeSpec(4, options={"object": "wooden_block"}))
-    frames, estimator = episode.frames, toy_estimator()
+    frames, estimator = episode.frames, StateEstimator(PoseEstimator(SMALL).eval())
     ticks = [{k: v[i] for k, v in frames.items()} for i in range(len(frames[ft.ACTION]))]
     found = np.stack([estimator.estimate(tick, ticks[0])[ft.TRUTH_CONTACT] for tick in ticks])
     assert frames[ft.TRUTH_CONTACT].any(0).all() and not frames[ft.TRUTH_CONTACT][0].any()

@@ -132,9 +132,7 @@ def test_test_strokes_are_not_learned_from() -> None:
         assert len(split.train) == 3 * len(split.validation)
 
 
-def test_the_benchmark_judges_every_encoder(
-    strokes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_encoders_are_judged(strokes: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     config = TouchBackboneConfig.for_sensor(PRESETS["tiny"], "gelsight_mini_markers")
     save(TouchBackbone(config), tmp_path / "tiny", {})
     name = str(tmp_path / "tiny")
@@ -195,11 +193,6 @@ def test_metrics_of_labels_and_fields_by_hand() -> None:
     assert field_metrics(0 * half[None], field, np.arange(2))["pressure_explained"] == 0
 
 
-def write_probes(folder: Path, strokes: int) -> None:
-    for probe in ("sphere", "sharp", "flat"):
-        write_force_batch(folder / probe / "batch_1", strokes=strokes)
-
-
 def test_bags_become_classes_of_their_motions(tmp_path: Path) -> None:
     write_pose_set(tmp_path, bags=5, pictures=14, shape=(32, 24))
     published = find_published(tmp_path, "gelsight_mini")
@@ -222,7 +215,8 @@ def test_bags_become_classes_of_their_motions(tmp_path: Path) -> None:
 
 def test_published_files_are_benchmarked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    write_probes(tmp_path / "files", strokes=5)
+    for probe in ("sphere", "sharp", "flat"):
+        write_force_batch(tmp_path / "files" / probe / "batch_1", strokes=5)
     options = Config(
         tasks=("force", "slip"), encoders=("end-to-end:tiny",), shares=(1.0,), data=tmp_path / "files",
         strokes=15, seeds=1, end_to_end_steps=2, end_to_end_batch_size=4, workers=1,

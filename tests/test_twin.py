@@ -28,10 +28,6 @@ def connect(address: str):
     return robot
 
 
-def through_franky(function: Any, fr3: RunningTwin, *arguments: object) -> dict[str, Any]:
-    return client(function, fr3.cell.address, HOME, *arguments, using=connect)
-
-
 def moves(address: str, home: list[float]) -> dict:
     """Full-speed moves; what the arm says to the limits of another arm, and to going too far."""
     import franky
@@ -82,7 +78,7 @@ def moves(address: str, home: list[float]) -> dict:
 @pytest.mark.realtime
 def test_franka_holds_clients_to_its_limits(fr3: RunningTwin) -> None:
     fr3.begin("reset 3")
-    result = through_franky(moves, fr3)
+    result = client(moves, fr3.cell.address, HOME, using=connect)
     assert "joint_motion_generator" in result["panda"] and "discontinuity" in result["panda"]
     assert "joint_motion_generator_" in result["far"] and "limits_violation" in result["far"]
     assert max(result["errors"]) < 2e-3

@@ -18,7 +18,6 @@ class Blocker(MetaPathFinder):
 
 sys.meta_path.insert(0, Blocker())
 
-import numpy as np
 from fake_cell import FakeCell, write_cell_file
 
 from touchgoal.control.cell.cell_file import read_cell_file
@@ -52,23 +51,19 @@ class Turns:
 """
 
 
-def run(folder: Path, policy: str, seconds: float) -> tuple[Result, dict]:
+def run(folder: Path, policy: str, seconds: float) -> tuple[Result, FakeCell]:
     text = CELL.replace("POLICY", policy).replace("40.0", str(seconds))
-    cell, fake, recorded = read_cell_file(write_cell_file(folder, text)), FakeCell(), {}
+    cell, fake = read_cell_file(write_cell_file(folder, text)), FakeCell()
     fake.gripper.follows = True
     safety = ActionFilter(FR3, 20)
     loaded = load_user_policy(cell, env_config_of(cell))
-
-    def record(frames: dict, task: str, meta: dict) -> int:
-        recorded.update(frames)
-        return 0
 
     def actor(loop: ControlLoop) -> Actor:
         return make_actor(cell, loaded, safety, None, loop.commanded)
 
     nobody = lambda: "", lambda _: None  # asks, or is told
-    session = Session(cell, fake.connection(), safety, record, True, actor, *nobody)
-    return session.run(), recorded
+    session = Session(cell, fake.connection(), safety, lambda *_: 0, True, actor, *nobody)
+    return session.run(), fake
 
 
 for path in (Path(__file__).parents[1] / "control" / "deployment").glob("*.py"):
@@ -76,10 +71,10 @@ for path in (Path(__file__).parents[1] / "control" / "deployment").glob("*.py"):
 assert not set(BLOCKED) & set(sys.modules)
 assert parse(deploy.Config, ["sim"], prog="deploy", description="", envs=None).cell == Path("sim")
 with tempfile.TemporaryDirectory() as name:
-    result, frames = run(Path(name), "expert", 40.0)
+    result, _ = run(Path(name), "expert", 40.0)
     assert result.ending.reason == "the plan is through", result.ending
     (Path(name) / "own.py").write_text(USER_POLICY)
-    result, frames = run(Path(name), f"{name}/own.py:Turns", 1.0)
+    result, fake = run(Path(name), f"{name}/own.py:Turns", 1.0)
     assert result.ending.reason.startswith("time is up"), result.ending
-    turned = np.ptp(frames["observation.state"][:, 0])
+    turned = fake.arm.reading.q[0] - FR3.arm.home[0]
     assert 0.04 < turned < 0.1, turned
