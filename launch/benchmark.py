@@ -84,7 +84,7 @@ def choose(arguments: list[str]) -> tuple[ModuleType, list[str]]:
 
 def main(config: Any) -> None:
     """Run the benchmark whose `Config` this is."""
-    import cv2
+    from touchgoal.runtime.picture_file import write_picture
 
     module = sys.modules[type(config).__module__]
     path = module.__name__.removeprefix("touchgoal.benchmarks.").removesuffix(".config")
@@ -94,7 +94,7 @@ def main(config: Any) -> None:
     result = benchmark.run(config)
     print(result.pop("table"))
     for title, picture in result.pop("pictures", {}).items():
-        cv2.imwrite(str(out / f"{title}.png"), picture[..., ::-1])
+        write_picture(out / f"{title}.png", picture)
         print(f"picture: {out / title}.png")
     print(f"hardware: {hardware()}")
     write_json(out / "metrics.json", {**provenance(), "hardware": hardware(), **result})

@@ -64,6 +64,7 @@ def main(config: Config) -> None:
     from touchgoal.control.tactile.sensor_models import find_model
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.picture_file import write_picture
     from touchgoal.runtime.progress import progress_bar
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run
@@ -114,5 +115,5 @@ def main(config: Config) -> None:
     save(fitted.calibration, out / "sensor_file", {**source, **record})
     write_json(out / "metrics.json", record)
     report.draw_held_out(judged, test, out / "held_out.png")
-    report.write_picture(out / "lights.png", light_compass(fitted.calibration))
+    write_picture(out / "lights.png", light_compass(fitted.calibration))
     print(f"sensor file: {out / 'sensor_file'}; pictures: {out / 'held_out.png'}, lights.png")

@@ -150,12 +150,11 @@ def _read_poses(path: Path, n_joints: int) -> list[Any]:
 
 
 def _save_views(views: "list[View]", out: Path) -> None:
-    import cv2
-
     from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.picture_file import write_picture
 
     for i, view in enumerate(views):
-        cv2.imwrite(str(out / f"view_{i:02d}.png"), view.image[..., ::-1])
+        write_picture(out / f"view_{i:02d}.png", view.image)
     write_json(out / "joints.json", [view.q.tolist() for view in views])
 
 

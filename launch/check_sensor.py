@@ -39,11 +39,11 @@ class Config:
 def main(config: Config) -> None:
     """Read the frames, print what they show, and draw the firmest presses."""
     from touchgoal.control.calibration import check_report
-    from touchgoal.control.calibration.report import write_picture
     from touchgoal.control.calibration.sensor_check import check_sensor
     from touchgoal.control.sensors.fingertip_source import is_recorded, open_frames
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.picture_file import write_picture
     from touchgoal.runtime.run_folder import open_run
 
     sensor, seconds = find_sensor(config.sensor), config.seconds

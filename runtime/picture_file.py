@@ -1,4 +1,4 @@
-"""Image files of unknown origin: an image, None, or a UserError, whatever the file holds."""
+"""Image files: reading those of unknown origin, and writing without silent failures."""
 
 import io
 import warnings
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
 _MOST_PIXELS = 50_000_000  # a small file may unpack to gigabytes
@@ -44,3 +45,8 @@ def decode_picture(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
     except cv2.error:
         return None
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def write_picture(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Write an RGB image as `atomic_write` does; cv2.imwrite would hide a full disk."""
+    write_file(path, cv2.imencode(path.suffix, picture[..., ::-1])[1].tobytes())

@@ -204,6 +204,14 @@ def test_shipped_sensor_files_fit_their_models(name: str) -> None:
     assert shipped.pixel_pitch == pytest.approx(model.pixel_pitch)
 
 
+def test_a_press_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    """cv2.imwrite would return False, and the press would be lost without a word."""
+    (tmp_path / "press_00.png.tmp").mkdir()  # stands for a disk that takes no file
+    presses = replace(made_presses(known_sensor(), 1), files=("press_00.png",))
+    with pytest.raises(OSError):
+        write_presses(presses, tmp_path)
+
+
 def test_circles_are_found_in_the_pictures(tmp_path: Path) -> None:
     """No column of circles: the visible disc is larger than the contact, which the fit then finds."""
     made = made_presses(known_sensor(), 16)

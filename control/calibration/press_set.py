@@ -5,14 +5,13 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
 from touchgoal.control.arrays import Circle, Circles, Picture, Pictures
 from touchgoal.control.calibration.ball import find_circle, squared_distance
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture
+from touchgoal.runtime.picture_file import read_picture, write_picture
 
 COLUMNS = ("file", "x_px", "y_px", "radius_px", "ball_mm")
 # Twelve are fitted and four held out. With fewer, the 30 response terms of a channel overfit single
@@ -60,8 +59,7 @@ def split(presses: PressSet, n_held_out: int, seed: int) -> tuple[PressSet, Pres
 
 def write_presses(presses: PressSet, folder: Path, adds: bool = False) -> None:
     """Write the folder that `read_presses` reads, or add presses to it with a new background."""
-    folder.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(folder / "background.png"), presses.background[..., ::-1])
+    write_picture(folder / "background.png", presses.background)
     with (folder / "presses.csv").open("a" if adds else "w", newline="") as file:
         rows = csv.writer(file)
         if file.tell() == 0:
@@ -69,7 +67,7 @@ def write_presses(presses: PressSet, folder: Path, adds: bool = False) -> None:
         for name, image, circle, ball in zip(
             presses.files, presses.images, presses.circles, presses.ball_radius, strict=True
         ):
-            cv2.imwrite(str(folder / name), image[..., ::-1])
+            write_picture(folder / name, image)
             known = "" if math.isnan(ball) else f"{ball * 1e3:g}"
             rows.writerow([name, *(f"{v:g}" for v in circle), known])
 

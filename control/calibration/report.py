@@ -17,6 +17,7 @@ from touchgoal.control.calibration.calibrate import FittedCalibration
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.picture_file import write_picture
 
 _USELESS = 0.9  # L1 errors above this share of the background's: the fit explains nothing
 _AT_LIMIT = 0.2  # share of circles at a search limit that is worth a warning
@@ -182,11 +183,6 @@ def draw_held_out(judged: FittedCalibration, test: PressSet, path: Path) -> None
     shown = test.take(np.arange(min(_MAX_SHOWN, len(test))))
     simulated = judged.simulate(shown, judged.fit_circles(shown))
     write_picture(path, side_by_side(list(shown.images), simulated))
-
-
-def write_picture(path: Path, picture: np.ndarray) -> None:
-    """Write an RGB picture."""
-    cv2.imwrite(str(path), picture[..., ::-1])
 
 
 def side_by_side(

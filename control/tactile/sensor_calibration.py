@@ -31,8 +31,9 @@ from jaxtyping import Float, Float32, Int
 
 from touchgoal.control.arrays import Counts, Map, Picture
 from touchgoal.control.tactile import gel
+from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture
+from touchgoal.runtime.picture_file import read_picture, write_picture
 
 N_FEATURES = 10
 PLACES = {2: 3, 3: 5}
@@ -158,14 +159,14 @@ def save(calibration: SensorCalibration, folder: Path, provenance: dict[str, Any
 
     `provenance` (JSON-able) says source, command, presses and held-out errors.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     rows, columns, _ = calibration.background.shape
     numbers = {name: _plain(getattr(calibration, name)) for name in _NUMBERS}
     version = next(n for n, places in PLACES.items() if places == calibration.response.shape[2])
     description = {"format": version, "image_shape": [rows, columns], **numbers}
     text = json.dumps({**description, "provenance": provenance}, indent=1)
-    cv2.imwrite(str(folder / _BACKGROUND), calibration.background[..., ::-1])
-    (folder / _JSON).write_text(_INNERMOST.sub(lambda m: " ".join(m[0].split()), text) + "\n")
+    write_picture(folder / _BACKGROUND, calibration.background)
+    one_line_lists = _INNERMOST.sub(lambda m: " ".join(m[0].split()), text)
+    write_file(folder / _JSON, f"{one_line_lists}\n".encode())
 
 
 def load(folder: Path) -> SensorCalibration:
