@@ -21,7 +21,7 @@ from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.teleoperation.config import TeleoperationConfig
-from touchgoal.control.teleoperation.device import HandMotion, Verdict
+from touchgoal.control.teleoperation.device import HandMotion, TeleoperationDevice
 from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
 from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
 from touchgoal.control.teleoperation.teleoperator import Teleoperator
@@ -116,21 +116,16 @@ def test_keys_are_held_for_a_moment_and_end_their_opposites() -> None:
     assert not motion.twist.any() and motion.gripper == "close"
 
 
-class Pushed:
+class Pushed(TeleoperationDevice):
     """A device that asks for one motion for ever, and then says that it is done."""
 
     def __init__(self, twist: list[float], ticks: float = np.inf) -> None:
         self.twist, self.ticks = np.array(twist, float), ticks
-        self.verdict: Verdict = ""
-
-    def press(self, keys: str) -> None: ...
 
     def read(self, observation: dict) -> HandMotion:
         self.ticks -= 1
         self.verdict = "" if self.ticks > 0 else "done"
         return HandMotion(self.twist, "close")
-
-    def close(self) -> None: ...
 
 
 def act(twist: list[float], wrench: tuple[float, ...] = (0.0,) * 6) -> tuple[np.ndarray, ...]:

@@ -1,7 +1,7 @@
-"""Interface of a teleoperation device: the motion of the hand that a person asks for."""
+"""Base of teleoperation devices: the motion of the hand that a person asks for."""
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -22,21 +22,17 @@ class HandMotion:
     gripper: GripperRequest = ""  # empty: go on as before
 
 
-@runtime_checkable
-class TeleoperationDevice(Protocol):
+class TeleoperationDevice:
     """A device that is read once a control tick."""
 
-    @property
-    def verdict(self) -> Verdict:
-        """How the device itself ends the episode; empty while a person must, by key."""
-        ...
+    verdict: Verdict = ""  #: how the device itself ends the episode; empty: a person does, by key
 
     def press(self, keys: str) -> None:
-        """Take what was typed at the terminal."""
+        """Take what was typed at the terminal, if the device is the keyboard."""
 
     def read(self, observation: Observation) -> HandMotion:
         """Return the present request without waiting; DriverError if the device has gone."""
-        ...
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Release the device."""
+        """Release the device, if there is one to release."""

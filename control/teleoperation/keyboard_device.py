@@ -3,7 +3,7 @@
 import numpy as np
 
 from touchgoal.control.features import Observation
-from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, Verdict
+from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, TeleoperationDevice
 
 HELP = "w/s away/back  a/d left/right  r/f up/down  j/l yaw  i/k pitch  u/o roll  g grip  h let go"
 # s for which a typed key counts as held. A terminal reports no releases; it repeats a held key after
@@ -19,10 +19,8 @@ _AXES = {
 _GRIPPER: dict[str, GripperRequest] = {"g": "close", "h": "open"}
 
 
-class KeyboardDevice:
+class KeyboardDevice(TeleoperationDevice):
     """Keys as full deflections; `hz` is the rate at which `read` is called."""
-
-    verdict: Verdict = ""
 
     def __init__(self, hz: float) -> None:
         self._hold_ticks = round(_HOLD_SECONDS * hz)
@@ -43,6 +41,3 @@ class KeyboardDevice:
         twist = sum((_AXES[key] for key in self._held), np.zeros(6))
         self._held = {key: ticks - 1 for key, ticks in self._held.items() if ticks > 1}
         return HandMotion(twist, self._gripper)
-
-    def close(self) -> None:
-        """Do nothing: `Terminal` owns the terminal."""

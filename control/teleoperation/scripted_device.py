@@ -14,7 +14,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.deployment.scripted import PickPlacePoses
 from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import Vector3, fingers_down, rotation_vector
-from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, Verdict
+from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, TeleoperationDevice
 
 _SLOW_WITHIN = 0.06, 0.4  # m and rad from a way-point within which the deflection shrinks
 _REACHED = 0.004, 0.03  # m and rad from a way-point
@@ -25,19 +25,14 @@ _PLACED = 0.015  # m between hand and goal
 _HELD = 0.004  # m of width: less is an empty hand
 
 
-class ScriptedDevice:
+class ScriptedDevice(TeleoperationDevice):
     """Goes from way-point to way-point; its verdict is "done" if it ends with an object at the goal."""
-
-    verdict: Verdict = ""
 
     def __init__(self, poses: PickPlacePoses) -> None:
         self._poses = poses
         self._recent: deque[np.ndarray] = deque(maxlen=_STILL_TICKS)  # position and width, m
         self._R = fingers_down(poses.grasp[3])
         self._motions = self._run()
-
-    def press(self, keys: str) -> None:
-        """Ignore the terminal."""
 
     def read(self, observation: Observation) -> HandMotion:
         """Return the motion to the present way-point."""
@@ -47,9 +42,6 @@ class ScriptedDevice:
         self._error = rotation_vector(self._R @ R.T)
         self._recent.append(np.append(self._position, self._width))
         return next(self._motions)
-
-    def close(self) -> None:
-        """Do nothing."""
 
     def _run(self) -> Iterator[HandMotion]:
         x, y, z, _ = self._poses.grasp

@@ -21,7 +21,7 @@ import numpy as np
 
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import DriverError
-from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, Verdict
+from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, TeleoperationDevice
 from touchgoal.runtime.errors import UserError
 
 _ROOT = Path("/sys/class/hidraw")
@@ -35,10 +35,8 @@ _LONGEST = 64  # bytes of a report over USB full speed
 _TO_BASE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-class SpaceMouse:
+class SpaceMouse(TeleoperationDevice):
     """The cap moves and turns the hand; the left button closes it, the right one opens it."""
-
-    verdict: Verdict = ""
 
     def __init__(self, root: Path = _ROOT, devices: Path = Path("/dev")) -> None:
         """Open the SpaceMouse that is plugged in; UserError if there is none or it is unreadable."""
@@ -53,9 +51,6 @@ class SpaceMouse:
         self._counts = np.zeros(6)  # translation, rotation, the device's axes
         self._gripper: GripperRequest = ""
         self._heard = 0.0  # monotonic s of the last report
-
-    def press(self, keys: str) -> None:
-        """Ignore the terminal."""
 
     def read(self, observation: Observation) -> HandMotion:
         """Return the newest deflection; DriverError if it was unplugged."""
