@@ -55,9 +55,6 @@ class Touch(WandTouch):
 
     # force (N) and torque (Nm) of the object on the gel at each picture, sensor frame
     wrench: Float32[np.ndarray, "t 6"]
-    # point, normal: where the object is touched and its outward normal there, m, bench frame
-    point: Float[np.ndarray, "3"]
-    normal: Float[np.ndarray, "3"]
 
 
 class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
@@ -173,7 +170,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         bench.place_wand(tip, axes)
         force = (action[5] + 1) / 2 * MAX_FORCE
         clip, load, wrench = self._press(tip, force * np.linspace(0, 1, CLIP))
-        return Touch(before, self._render(), clip, load, wrench, point, normal)
+        return Touch(before, self._render(), clip, load, wrench)
 
     def untouched(self, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
         """Return the untouched gel's picture, with the camera's noise drawn from `rng`."""

@@ -11,7 +11,7 @@ from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 from numba import njit
 
 from touchgoal.control.tactile.sensor_models import SensorModel
@@ -19,7 +19,6 @@ from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.tactile.geometry import Grid
 from touchgoal.sim_envs.tactile.press import Press, solve3
 
-_ON_CONE = 0.99  # share of the friction limit that counts as slip
 _MAX_CORRECTION = 0.9  # share of a cell's normal force
 # Keep the bristles' motion finite where friction cannot carry the load; shares of their stiffness.
 # Where the patch cannot carry both, torsion yields to force.
@@ -35,8 +34,6 @@ class ForceField:
 
     normal: Float32[np.ndarray, "h w"]  # N per cell, + pressed; grid centred on the sensor frame
     tangential: Float32[np.ndarray, "2 h w"]  # N per cell, along the sensor's x and y
-    slipping: Bool[np.ndarray, "h w"]  # cells whose traction lies on the friction cone
-    slip_fraction: float  # share of the normal force that slipping cells carry
     pitch: float  # size of a cell, m
     displacement: tuple[float, float, float]  # (x, y, z) of the whole gel from rest, m
 
@@ -205,11 +202,11 @@ def _balance(bristles, stiffness, area, force_x, force_y, torsion):
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _brush(normal, before, pitch, place, friction, stiffness, force, torque, out, slip):
-    """Find tractions that balance force and torque; return the share of the load that slips."""
+def _brush(normal, before, pitch, place, friction, stiffness, force, torque, out):
+    """Write the tractions that balance force and torque to `out`."""
     bristles, cx, cy, load = _bristles(normal, before, pitch, place, friction)
     if load == 0.0:
-        return 0.0
+        return
     torsion = torque - (cx * force[1] - cy * force[0])
     ux, uy, turn = _balance(bristles, stiffness, pitch * pitch, force[0], force[1], torsion)
     carried = np.empty(9)
@@ -219,12 +216,10 @@ def _brush(normal, before, pitch, place, friction, stiffness, force, torque, out
     polar = (limit * (x * x + y * y)).sum() / friction
     left_x, left_y = (force[0] - carried[0]) / load, (force[1] - carried[1]) / load
     left_turn = (torsion - carried[2]) / polar if polar > 0.0 else 0.0
-    n, sliding = 0, 0.0
+    n = 0
     for i in range(normal.shape[0]):
         for j in range(normal.shape[1]):
             p = normal[i, j]
-            out[0, i, j] = out[1, i, j] = 0.0
-            slip[i, j] = False
             if p > 0.0:
                 x, y, qx, qy, limit = bristles[:, n]
                 tx, ty = qx + stiffness * (ux - turn * y), qy + stiffness * (uy + turn * x)
@@ -232,10 +227,7 @@ def _brush(normal, before, pitch, place, friction, stiffness, force, torque, out
                 share = limit / max(size, limit)
                 out[0, i, j] = tx * share + p * (left_x - left_turn * y)
                 out[1, i, j] = ty * share + p * (left_y + left_turn * x)
-                slip[i, j] = size >= _ON_CONE * limit
-                sliding += p * slip[i, j]
                 n += 1
-    return sliding / load
 
 
 def force_field(
@@ -260,11 +252,10 @@ def force_field(
     pitch = 2 * press.pitch
     normal = np.empty((rows, columns), np.float32)
     tangential = np.zeros((2, rows, columns), np.float32)
-    slipping = np.zeros((rows, columns), bool)
     _pool(press.pressure, np.float32(press.pitch**2), normal)
     (fx, fy, _), (tx, ty, tz), (_, _, z) = contact.force, contact.torque, press.displacement
     _match_moments(normal, pitch, press.displacement, ty - z * fx, -tx - z * fy)
-    slip_fraction = _brush(
+    _brush(
         normal,
         tangential if before is None else before.tangential,
         pitch,
@@ -274,9 +265,8 @@ def force_field(
         contact.force,
         tz,
         tangential,
-        slipping,
     )
-    return ForceField(normal, tangential, slipping, slip_fraction, pitch, press.displacement)
+    return ForceField(normal, tangential, pitch, press.displacement)
 
 
 def resample_to_image(
