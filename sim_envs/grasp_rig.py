@@ -26,7 +26,7 @@ _MASS, _GRIP = (0.1, 1.0), (0.8, 10.0)  # kg, N of each finger: drawn log-unifor
 _ASIDE, _ABOVE = 8e-3, (-4e-3, 10e-3)  # m from the object's middle, along the pads and upwards
 _TURN = math.radians(12)  # largest turn of the object against the pads
 _OPEN, _CLOSING, _LIFTING = 0.04, 0.08, 0.1  # m of one finger; m/s of one finger; m/s
-_LOOKS = 0.05  # s between readings of the pads, whose stick and slip depend on earlier readings
+_STEP = 0.01  # s between set-points
 _SHOWN_AT, _TOP = 0.01, 0.06  # m of lift: at the third image, before the shake
 _SHAKE, _SHAKES, _SHAKING = 0.012, 3.0, 1.0  # m, Hz, s
 _LOWEST = 0.018  # m: lowest height of the pads' middle above the table
@@ -58,14 +58,14 @@ def attempt_grasp(config: RigConfig, index: int) -> GraspAttempt:
     hand = _Hand(body, grip, sensor, units, config.shear_relief, rng)
     hand.place(rng)
     hand.run(0.1)
-    hand.look(keep=True)
+    hand.read_pads(keep=True)
     hand.close()
-    hand.look(keep=True)
+    hand.read_pads(keep=True)
     hand.lift(_SHOWN_AT)
-    hand.look(keep=True)
+    hand.read_pads(keep=True)
     hand.lift(_TOP)
     hand.shake()
-    left, right = (np.stack([looks[side] for looks in hand.pictures]) for side in range(2))
+    left, right = (np.stack([images[side] for images in hand.images]) for side in range(2))
     wrench = np.array(hand.wrenches, np.float32)
     return GraspAttempt(left, right, wrench, hand.holds(), body, grip)
 
@@ -90,7 +90,7 @@ class _Hand:
             for side, unit in zip(SIDES, units, strict=True)
         ]
         self._height, self._fingers = 0.0, _OPEN
-        self.pictures: list[list[np.ndarray]] = []
+        self.images: list[list[np.ndarray]] = []
         self.wrenches: list[np.ndarray] = []
 
     def place(self, rng: np.random.Generator) -> None:
@@ -110,39 +110,38 @@ class _Hand:
     def run(self, seconds: float) -> None:
         mujoco.mj_step(self.model, self.data, nstep=round(seconds / self.model.opt.timestep))
 
-    def look(self, keep: bool = False) -> None:
-        """Read both pads, in order of time; `keep` stores images and wrenches."""
+    def read_pads(self, keep: bool = False) -> None:
+        """Read both pads, whose stick and slip depend on earlier readings; `keep` stores them."""
         mujoco.mj_forward(self.model, self.data)
         pads, _ = self._reader.read(self.data)
         images = [
             p.sense(self.data, c, self._rng).image for p, c in zip(self._pads, pads, strict=True)
         ]
         if keep:
-            self.pictures.append(images)
+            self.images.append(images)
             self.wrenches.append(np.concatenate([w for c in pads for w in (c.force, c.torque)]))
 
     def close(self) -> None:
         """Close the fingers until they press with the grip, and a little longer."""
         deepest = -2 * self._grip / float(self.model.actuator("gripper").gainprm[0])
         while self._fingers > -0.005:
-            self._fingers -= _CLOSING * _LOOKS / 5
+            self._fingers -= _CLOSING * _STEP
             self.data.actuator("gripper").ctrl = max(self._fingers, -0.002 + deepest)
-            self.run(_LOOKS / 5)
-        self.look()
+            self.run(_STEP)
+        self.read_pads()
         self.run(0.2)
 
     def lift(self, height: float) -> None:
         servo = self.data.actuator("lift")
         while servo.ctrl[0] < self._height + height:
-            servo.ctrl = servo.ctrl + _LIFTING * _LOOKS / 5
-            self.run(_LOOKS / 5)
-        self.look()
+            servo.ctrl = servo.ctrl + _LIFTING * _STEP
+            self.run(_STEP)
+        self.read_pads()
 
     def shake(self) -> None:
-        step = 0.01
-        for t in np.arange(0.0, _SHAKING, step):
+        for t in np.arange(0.0, _SHAKING, _STEP):
             self.data.actuator("shake").ctrl = _SHAKE * math.sin(2 * math.pi * _SHAKES * t)
-            self.run(step)
+            self.run(_STEP)
         self.data.actuator("shake").ctrl = 0.0
         self.run(0.2)
 

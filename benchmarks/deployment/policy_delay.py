@@ -49,7 +49,7 @@ def run(config: Config) -> dict[str, Any]:
     """Return success by delay, jitter and image rate, or by cause, with the trials."""
     env = ENVS[config.task]
     cases = _causes() if config.causes else _delays(config)
-    envs = ((what, replace(env, as_deployed=d, deployment=between)) for what, d, between in cases)
+    envs = ((what, replace(env, as_deployed=whole, deployment=own)) for what, whole, own in cases)
     return try_cases(config, envs)
 
 
@@ -60,9 +60,8 @@ def _delays(config: Config) -> Iterator[tuple[str, bool, DeploymentConfig]]:
                 half = (delay / 2000, delay / 2000)  # s: before the policy, and after it
                 more = (jitter / 1000, jitter / 1000)
                 late = DeploymentConfig(state_delay=half, picture_delay=half, command_delay=half)
-                between = replace(late, jitter=more, picture_rate=rate)
                 what = f"{delay:.0f} ms, jitter {jitter:.0f} ms, pictures {rate:.0f} Hz"
-                yield what, True, between
+                yield what, True, replace(late, jitter=more, picture_rate=rate)
 
 
 def _causes() -> Iterator[tuple[str, bool, DeploymentConfig]]:

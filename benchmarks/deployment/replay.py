@@ -98,12 +98,13 @@ def replay_both(seed: int, number: int = 0) -> Iterator[dict[str, Any]]:
 
 def _environment() -> PickPlace:
     none, delay = (0.0, 0.0), (_DELAY, _DELAY)
-    between = DeploymentConfig(
+    deployment = DeploymentConfig(
         command_delay=delay, state_delay=none, jitter=none, estimated_wrench=False
     )
     # fingertips as the twin's, drawn by the same seed, so that arm and object begin alike
-    config = PickPlaceConfig(objects=(_OBJECT,), cameras=(), as_deployed=True, deployment=between)
-    env = PickPlace(config)
+    env = PickPlace(
+        PickPlaceConfig(objects=(_OBJECT,), cameras=(), as_deployed=True, deployment=deployment)
+    )
     env.robot = _able_to_press(env.robot)
     return env
 

@@ -110,21 +110,21 @@ class LockStepClock:
 
     def wait(self, until: float) -> None:
         """See Clock."""
-        weighed = -np.inf
+        last_load = -np.inf
         while (steps := round((until - self._time) / _DT)) > 0 and not self._lost:
             # An advance ends at the latest when the stream's next command is due.
             steps = min(steps, _STREAM_STEPS - round(self._time / _DT) % _STREAM_STEPS)
             answer = self._ask(f"advance {steps} {int(self._driven)} {self._issued}")
             if self._lost:
                 break
-            self._time, self._answered, weighed = (answer[key] for key in ("time", "hand", "load"))
+            self._time, self._answered, last_load = (answer[k] for k in ("time", "hand", "load"))
             self._history.append((time.monotonic(), self._time))
             if not answer["frozen"]:
                 self._let_drivers_tick()
         if self._lost:
             self._wait_without_twin(until)
         self._await_pictures({} if self._lost else self._ask("pictures"))
-        self._await_load(weighed)
+        self._await_load(last_load)
 
     def close(self) -> None:
         """Let the twin's time go on by itself."""

@@ -130,10 +130,11 @@ def _arm(connection: CellConnection, safety: ActionFilter) -> str:
 def _limits(cell: CellConfig, safety: ActionFilter) -> str:
     if cell.fingertips is not None:
         require_readable(find_sensor(cell.sensor), safety.limits.indentation)
-    dogs = safety.watchdogs
+    watchdogs = safety.watchdogs
     return (
         f"joints up to {safety.joints.velocity.max():.2f} rad/s; holds when pictures are older than "
-        f"{1e3 * dogs.observation.hold:.0f} ms or the arm's state than {1e3 * dogs.state.hold:.0f}"
+        f"{1e3 * watchdogs.observation.hold:.0f} ms or the arm's state than "
+        f"{1e3 * watchdogs.state.hold:.0f}"
     )
 
 

@@ -120,15 +120,15 @@ class DeployedHand:
 class DeployedArm:
     """The environment's arm as deployed, for one episode that begins at rest."""
 
-    def __init__(self, env: Any, between: DeploymentConfig, rng: np.random.Generator) -> None:
+    def __init__(self, env: Any, deployment: DeploymentConfig, rng: np.random.Generator) -> None:
         """Draw delays of an environment's episode from a resolved config."""
-        assert between.plan_ticks is not None
+        assert deployment.plan_ticks is not None
         self._env = env
         hz = env.config.control_hz
         self._tick_ms = round(1000 / hz)
         start = env.command.copy()
         n = env.n_joints
-        if between.tracker:
+        if deployment.tracker:
             # Set-points with feed-forward reach beyond the joints' range; the tracker keeps to it.
             env.model.actuator_ctrllimited[:n] = 0
             self._drive: _TrackedDrive | _DirectDrive = _TrackedDrive(
@@ -137,17 +137,17 @@ class DeployedArm:
         else:
             limits = env.model.actuator_ctrlrange[:n]
             self._drive = _DirectDrive(start, limits, self._tick_ms)
-        self._hand = DeployedHand(env, rng) if between.franka_hand else None
-        self._wrench = EstimatedWrench(rng) if between.estimated_wrench else None
-        self.plan_ticks = int(rng.choice(between.plan_ticks))  # by which learned plans are late
+        self._hand = DeployedHand(env, rng) if deployment.franka_hand else None
+        self._wrench = EstimatedWrench(rng) if deployment.estimated_wrench else None
+        self.plan_ticks = int(rng.choice(deployment.plan_ticks))  # by which learned plans are late
         ticks = round(env.config.max_seconds * hz) + _AHEAD
-        jitter = rng.uniform(*_range(between.jitter))
-        self._state_at = _read_times(rng, between.state_delay, jitter, ticks, self._tick_ms)
-        period = 1000 / (between.picture_rate or 1000.0)
+        jitter = rng.uniform(*_range(deployment.jitter))
+        self._state_at = _read_times(rng, deployment.state_delay, jitter, ticks, self._tick_ms)
+        period = 1000 / (deployment.picture_rate or 1000.0)
         self._picture_at = _read_times(
-            rng, between.picture_delay, jitter, ticks, self._tick_ms, period
+            rng, deployment.picture_delay, jitter, ticks, self._tick_ms, period
         )
-        delays = _delays(rng, between.command_delay, jitter, ticks)
+        delays = _delays(rng, deployment.command_delay, jitter, ticks)
         # A command never overtakes the one before it.
         self._arrives = np.maximum.accumulate(np.arange(ticks) * self._tick_ms + delays)
         self._steps = round(_DT / env.model.opt.timestep)

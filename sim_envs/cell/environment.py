@@ -280,9 +280,9 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         self._ticks = 0
         self._force.reset()
         self._deployed: DeployedArm | None = None
-        between = self.config.resolved_deployment()
-        if between != IDEAL_DEPLOYMENT:
-            self._deployed = DeployedArm(self, between, self.np_random.spawn(1)[0])
+        deployment = self.config.resolved_deployment()
+        if deployment != IDEAL_DEPLOYMENT:
+            self._deployed = DeployedArm(self, deployment, self.np_random.spawn(1)[0])
 
     def _observe(self) -> Observation:
         command = {ft.COMMAND: self._read_command()}

@@ -23,7 +23,7 @@ GRIPPER_MAX_WIDTH = FRANKA_HAND.stroke[1]  # m, to which experts open
 GRIPPER_SPEED = FRANKA_HAND.speed  # m/s of width
 _FINGER_LAG = 1e-3  # m by which a freely moving finger lags its set-point, at most
 
-_QUIET = 2.0  # Nm on a joint; 20 N on the hand over the table, from any side, exceed it somewhere
+_LEAST_TORQUE = 2.0  # Nm; 20 N on the hand over the table, from any side, load some joint with more
 
 
 class SimulatedHardware(ABC):
@@ -98,9 +98,9 @@ class SimulatedHardware(ABC):
         """Return the robot's contact force (N) in the last step, base frame; 0 if small.
 
         Reading contacts takes as long as a physics step, so they are read only if the torque on some
-        joint exceeds `_QUIET`.
+        joint exceeds `_LEAST_TORQUE`.
         """
-        if np.abs(self.data.qfrc_constraint[self.arm_dofs]).max() < _QUIET:
+        if np.abs(self.data.qfrc_constraint[self.arm_dofs]).max() < _LEAST_TORQUE:
             return np.zeros(3)
         _, wrench = self._reader.read(self.data)
         return wrench[:3]
