@@ -20,6 +20,7 @@ from touchgoal.runtime.option_types import (
 from touchgoal.sim_envs.scene.objects import find as find_object
 from touchgoal.sim_envs.scene.wires import PER_FAMILY, TRAINED, Family, Split, Wire, choose
 from touchgoal.sim_envs.scene.wires import find as find_wire
+from touchgoal.sim_envs.surroundings import USUAL, Surroundings
 
 Outcome = Literal[
     "success",
@@ -237,6 +238,8 @@ class EnvConfig(SceneConfig):
     light_change: Annotated[LightChange, RARE] = (0.0,)
     """Change of the fingertips' light after an episode's first image, as a share: one value, or
     red, green and blue. -0.15 dims them by 15 %."""
+    surroundings: Annotated[Surroundings, RARE] = USUAL
+    """Changes of the front camera and of the light in the room."""
     as_deployed: bool = False
     """Simulate the delays, limits and measurement errors of an arm driven by `deploy`."""
     deployment: DeploymentConfig = DeploymentConfig()
@@ -277,6 +280,12 @@ class PickPlaceConfig(EnvConfig):
     """Range of the force of each finger, N."""
     tolerance: Annotated[float, Field(gt=0, le=0.1, allow_inf_nan=False)] = 0.02
     """Largest distance of the placed object's centre from the goal, m."""
+    size_factor: Annotated[Positive, RARE] = 1.0
+    """Factor of the objects' sizes."""
+    friction_factor: Annotated[Positive, RARE] = 1.0
+    """Factor of the objects' friction."""
+    nudge: Annotated[NotNegative, RARE] = 0.0
+    """Distance by which the object is moved a second after the start, in a random direction, m."""
     release: bool = False
     """Success also requires that the hand lets go. The paper's reward curves end in touch, so by
     default an episode ends with the placed object still in the hand."""

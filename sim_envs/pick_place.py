@@ -107,6 +107,7 @@ class PickPlace(FrankaTactileEnv):
             self.bodies.append(
                 sample_body(other, rng, rng.uniform(*config.mass), f"distractor_{i + 1}")
             )
+        self.bodies = [b.scaled(config.size_factor, config.friction_factor) for b in self.bodies]
         taken = [np.array(p) for p in (chosen.start, chosen.goal) if p is not None]
         drawn = iter(_random_positions(rng, len(self.bodies) + 1 - len(taken), taken))
         start = next(drawn) if chosen.start is None else np.array(chosen.start)
@@ -133,6 +134,13 @@ class PickPlace(FrankaTactileEnv):
             joint = self.data.joint(body.name)
             joint.qpos[:3] = *position, body.rest_height + 0.001
             joint.qpos[3:] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
+
+    def begin_tick(self) -> None:
+        """Move the object a second after the start, if `nudge` asks for it."""
+        if self.config.nudge and self._ticks == self.config.control_hz:
+            angle = self.np_random.uniform(-np.pi, np.pi)
+            away = self.config.nudge * np.array([np.cos(angle), np.sin(angle)])
+            self.data.joint("object").qpos[:2] += away
 
     def _let_settle(self) -> None:
         super()._let_settle()

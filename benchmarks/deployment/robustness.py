@@ -13,6 +13,7 @@ from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.sim_envs.config import TaskConfig, TaskName
 from touchgoal.sim_envs.scene.objects import NEW_KINDS
 from touchgoal.sim_envs.scene.wires import HELD_OUT
+from touchgoal.sim_envs.surroundings import Surroundings
 
 _LIGHT = {
     f"light {change:+.0%}": {"light_change": (change,)} for change in (-0.15, -0.05, 0.1, -0.8)
@@ -29,6 +30,14 @@ _CHANGES: dict[TaskName, dict[str, dict[str, Any]]] = {
         "2 other objects, target named": {"distractors": 2},
         "kinds never trained on": {"objects": tuple(NEW_KINDS)},
         "mass x2": {"mass": (0.04, 0.4)},
+        "size x1.2": {"size_factor": 1.2},
+        "friction x0.5": {"friction_factor": 0.5},
+        "object moved 2 cm after a second": {"nudge": 0.02},
+        "camera turned 5 degrees up": {"surroundings": Surroundings(camera_turn=(0.0, 5.0))},
+        "camera turned 5 degrees aside": {"surroundings": Surroundings(camera_turn=(5.0, 0.0))},
+        "camera moved 2 cm aside": {"surroundings": Surroundings(camera_shift=(0.0, 0.02, 0.0))},
+        "lamp moved 40 cm": {"surroundings": Surroundings(lamp_shift=(-0.4, 0.0, 0.0))},
+        "room light -80%": {"surroundings": Surroundings(room_light=-0.8)},
     },
     "bead-maze": {
         **_LIGHT,

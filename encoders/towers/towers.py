@@ -224,7 +224,8 @@ def _resize_shorter_side(images: np.ndarray, size: int) -> Tensor:
 
 
 def _normalised(pixels: Tensor, mean: tuple[float, ...], std: tuple[float, ...]) -> Tensor:
-    return (pixels - torch.tensor(mean)[:, None, None]) / torch.tensor(std)[:, None, None]
+    mean, std = (torch.tensor(v, device=pixels.device)[:, None, None] for v in (mean, std))
+    return (pixels - mean) / std
 
 
 def _on_all_cores(embed: Callable[[np.ndarray], T], images: np.ndarray, size: int) -> list[T]:

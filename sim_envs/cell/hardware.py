@@ -16,6 +16,7 @@ from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
 from touchgoal.sim_envs.scene.contacts import ContactReader, PadContact
 from touchgoal.sim_envs.scene.objects import Body
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
+from touchgoal.sim_envs.surroundings import UsualScene
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
@@ -163,6 +164,7 @@ class SimulatedHardware(ABC):
         self.close()
         self._noise_rng = rng
         self.model = model = self.scene(self.config).compile()
+        UsualScene.of(model).change(model, self.config.surroundings)
         self.data = mujoco.MjData(model)
         joints = [model.joint(name) for name in arm_joints(self.config.arm)]
         self.arm_positions = np.array([joint.qposadr[0] for joint in joints])

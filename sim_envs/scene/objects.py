@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cache
 from pathlib import Path
@@ -71,6 +71,16 @@ class Body:
     mass: float  # kg
     name: str = "object"
     hull: Float[np.ndarray, "n 3"] | None = field(default=None, compare=False)
+
+    def scaled(self, size: float, friction: float) -> "Body":
+        """Return it with size and friction multiplied."""
+        material = replace(self.kind.material, friction=friction * self.kind.material.friction)
+        return replace(
+            self,
+            kind=replace(self.kind, material=material),
+            size=tuple(size * s for s in self.size),
+            hull=None if self.hull is None else size * self.hull,
+        )
 
     @property
     def rest_height(self) -> float:

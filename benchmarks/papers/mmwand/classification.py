@@ -59,6 +59,10 @@ class Config(BenchmarkOptions):
     """Inputs of the fine-tuned networks."""
     epochs: Count = 12
     """Passes of their training over the touches."""
+    picture_rows: Count = 112
+    """Rows of their pictures, px."""
+    device: str = "cpu"
+    """Device of their training, as torch names it: cpu, cuda."""
     cache: Path = Path("runs/mmwand-embeddings")
     """Folder that keeps the embeddings."""
     seed: Seed = 0
@@ -87,13 +91,13 @@ def run(config: Config) -> dict[str, Any]:
 def _fine_tuned(config: Config, data: EmbeddedSet) -> list[dict[str, Any]]:
     if not config.fine_tuned:
         return []
-    pictures, rows = read_pictures(WandSet.open(config.data)), []
+    pictures, rows = read_pictures(WandSet.open(config.data), config.picture_rows), []
     for split in config.splits:
         fold = split_touches(split, data.label, data.visit, data.describes, config.seed)
         for network in config.fine_tuned:
             for modality in config.modalities:
                 inputs = list(pictures.values()) if modality == "both" else [pictures[modality]]
-                rest = data.label, fold.train, fold.test, config.epochs, config.seed
+                rest = data.label, fold, config.epochs, config.seed, config.device
                 right = fine_tune(network, inputs, *rest)
                 found = mean_over_objects(data.label[fold.test], right)
                 what = f"{network} fine-tuned, {modality}"

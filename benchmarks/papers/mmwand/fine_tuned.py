@@ -15,6 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from touchgoal.benchmarks.real_touch.embedders import difference_pictures
+from touchgoal.encoders.alignment.splits import Fold
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.efficientnet import FEATURES, load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
@@ -23,7 +24,6 @@ from touchgoal.runtime.progress import track
 
 Network = Literal["efficientnet", "resnet", "vit"]
 Modality = Literal["image", "touch", "both"]
-SIZE = 112, 144  # rows and columns of the networks' input, px
 _BATCH = 32
 _RATES = {"efficientnet": 5e-4, "resnet": 1e-3, "vit": 1e-3}
 _DECAY = 0.05
@@ -31,53 +31,61 @@ _DECAY = 0.05
 Pictures = UInt8[np.ndarray, "n h w 3"]
 
 
-def read_pictures(data: WandSet) -> dict[Modality, Pictures]:
-    """Read the wand's view before contact and the change of each touch about grey, small."""
+def read_pictures(data: WandSet, rows: int) -> dict[Modality, Pictures]:
+    """Read the wand's view before contact and the change of each touch about grey, of so many rows."""
     views, touches = [], []
     for i in track(range(len(data)), "reading pictures", "touch"):
         untouched, touched = data.pictures(i)
-        touches.append(_small(difference_pictures(touched[None], untouched)[0]))
-        views.append(_small(data.view(i)))
+        touches.append(_resized(difference_pictures(touched[None], untouched)[0], rows))
+        views.append(_resized(data.view(i), rows))
     return {"image": np.stack(views), "touch": np.stack(touches)}
 
 
-def _small(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "a b 3"]:
-    return cv2.resize(picture, SIZE[::-1], interpolation=cv2.INTER_AREA)
+def _resized(picture: UInt8[np.ndarray, "h w 3"], rows: int) -> UInt8[np.ndarray, "{rows} w 3"]:
+    """Return a picture of 9:7, about a sensor's shape."""
+    return cv2.resize(picture, (rows * 9 // 7, rows), interpolation=cv2.INTER_AREA)
 
 
 def fine_tune(
     network: Network,
     inputs: list[Pictures],
     label: Int[np.ndarray, " n"],
-    train: Int[np.ndarray, " a"],
-    test: Int[np.ndarray, " b"],
+    fold: Fold,
     epochs: int,
     seed: int,
+    device: str,
 ) -> Float[np.ndarray, " b"]:
     """Fine-tune on the training rows; return which test rows are named rightly after the last epoch.
 
     Args:
         inputs: pictures of one modality, or of several, each with a network of its own.
         epochs: passes over the training rows.
+        device: as torch names it.
     """
     generator = torch.Generator().manual_seed(seed)
+    pictures = [torch.from_numpy(p).to(device) for p in inputs]
+    names, on_gpu = torch.from_numpy(label), torch.device(device).type == "cuda"
+    mixed = torch.autocast(torch.device(device).type, torch.bfloat16, enabled=on_gpu)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = _Classifier([_backbone(network) for _ in inputs], int(label.max()) + 1)
+        made = [_backbone(network, p.shape[1:3]) for p in inputs]
+        model = _Classifier(made, int(label.max()) + 1)
+    model.to(device)
     optimizer = torch.optim.AdamW(model.parameters(), _RATES[network], weight_decay=_DECAY)
-    steps = epochs * (len(train) // _BATCH)
+    steps = epochs * (len(fold.train) // _BATCH)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATES[network], total_steps=steps)
     order = torch.cat(
         [
-            torch.randperm(len(train), generator=generator)[: steps // epochs * _BATCH]
+            torch.randperm(len(fold.train), generator=generator)[: steps // epochs * _BATCH]
             for _ in range(epochs)
         ]
     )
     model.train()
     for rows in track(order.split(_BATCH), f"fine-tuning {network}", "step", steps):
-        chosen = train[rows.numpy()]
-        logits = model([_shifted(_tensor(p[chosen]), generator) for p in inputs])
-        loss = F.cross_entropy(logits, torch.from_numpy(label[chosen]), label_smoothing=0.1)
+        chosen = torch.from_numpy(fold.train)[rows]
+        with mixed:
+            logits = model([_shifted(_normalised(p[chosen]), generator) for p in pictures])
+        loss = F.cross_entropy(logits.float(), names[chosen].to(device), label_smoothing=0.1)
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -86,14 +94,14 @@ def fine_tune(
     model.eval()
     with torch.no_grad():
         found = [
-            model([_tensor(p[rows]) for p in inputs]).argmax(1)
-            for rows in np.array_split(test, len(test) // _BATCH + 1)
+            model([_normalised(p[rows]) for p in pictures]).argmax(1).cpu()
+            for rows in torch.from_numpy(fold.test).split(_BATCH)
         ]
-    return (torch.cat(found).numpy() == label[test]).astype(float)
+    return (torch.cat(found).numpy() == label[fold.test]).astype(float)
 
 
-def _tensor(pictures: Pictures) -> Float[Tensor, "n 3 h w"]:
-    return imagenet_normalised(torch.from_numpy(pictures).permute(0, 3, 1, 2) / 255)
+def _normalised(pictures: UInt8[Tensor, "n h w 3"]) -> Float[Tensor, "n 3 h w"]:
+    return imagenet_normalised(pictures.permute(0, 3, 1, 2) / 255)
 
 
 def _shifted(
@@ -122,10 +130,13 @@ class _Classifier(nn.Module):
         return self.head(torch.cat([features(module, x) for features, module, x in parts], 1))
 
 
-def _backbone(network: Network) -> tuple[nn.Module, Callable[[nn.Module, Tensor], Tensor], int]:
+def _backbone(
+    network: Network, size: tuple[int, ...]
+) -> tuple[nn.Module, Callable[[nn.Module, Tensor], Tensor], int]:
     """Return a network, the function that gives its features, and their number."""
     if network == "efficientnet":
-        return load_efficientnet_lite0(), lambda m, x: m.features(x), FEATURES  # pyright: ignore[reportCallIssue]
+        network_ = load_efficientnet_lite0(fuse=False)
+        return network_, lambda m, x: m.features(x), FEATURES  # pyright: ignore[reportCallIssue]
     try:
         from transformers import ResNetConfig, ResNetModel, ViTConfig, ViTModel
     except ImportError as error:
@@ -140,7 +151,7 @@ def _backbone(network: Network) -> tuple[nn.Module, Callable[[nn.Module, Tensor]
         return ResNetModel(small), lambda m, x: m(x).pooler_output.flatten(1), 256
     width = 192
     tiny = ViTConfig(
-        image_size=list(SIZE),  # pyright: ignore[reportArgumentType]  # takes both sides
+        image_size=list(size),  # pyright: ignore[reportArgumentType]  # takes both sides
         patch_size=16,
         hidden_size=width,
         num_hidden_layers=6,

@@ -1,0 +1,78 @@
+"""Differences between the cell of an episode and the usual one: front camera, lamp, room light."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from touchgoal.runtime.option_types import checked_dataclass
+
+Degrees = Annotated[float, Field(ge=-45, le=45)]
+Metres = Annotated[float, Field(ge=-1, le=1)]
+_MOST_TURN, _MOST_SHIFT, _MOST_LAMP = 7.0, 0.03, 0.4  # of `draw`, degrees and m
+_DIMMEST, _BRIGHTEST = 0.15, 1.3  # of `draw`, shares of the usual light
+
+
+@checked_dataclass
+class Surroundings:
+    """Changes of the front camera and of the light."""
+
+    camera_turn: tuple[Degrees, Degrees] = (0.0, 0.0)
+    """Turn of the front camera to its right and upwards, degrees."""
+    camera_shift: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
+    """Shift of the front camera in the base frame, m."""
+    lamp_shift: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
+    """Shift in the base frame of the lamp that casts shadows, m."""
+    room_light: Annotated[float, Field(ge=-0.95, le=1)] = 0.0
+    """Change of all light in the room, as a share; -0.8 dims it by 80 %."""
+
+
+USUAL = Surroundings()
+
+
+def draw(rng: np.random.Generator) -> Surroundings:
+    """Draw surroundings within 7 degrees, 3 cm, 0.4 m of the lamp, and 0.15 to 1.3 of the light."""
+    yaw, pitch = rng.uniform(-_MOST_TURN, _MOST_TURN, 2)
+    x, y, z = rng.uniform(-_MOST_SHIFT, _MOST_SHIFT, 3)
+    a, b, c = rng.uniform(-_MOST_LAMP, _MOST_LAMP, 3)
+    light = float(np.exp(rng.uniform(np.log(_DIMMEST), np.log(_BRIGHTEST)))) - 1
+    return Surroundings((yaw, pitch), (x, y, z), (a, b, c), light)
+
+
+@dataclass(frozen=True, eq=False)
+class UsualScene:
+    """Camera and lights of a compiled scene, from which surroundings differ."""
+
+    eye: Float[np.ndarray, "3"]
+    quat: Float[np.ndarray, "4"]
+    lamp: Float[np.ndarray, "3"]
+    light: tuple[Float[np.ndarray, "..."], ...]
+
+    @classmethod
+    def of(cls, model: Any) -> "UsualScene":
+        """Note those of an unchanged MjModel."""
+        camera = model.camera("front")
+        light = tuple(a.copy() for a in _light(model))
+        return cls(camera.pos.copy(), camera.quat.copy(), model.light_pos[0].copy(), light)
+
+    def change(self, model: Any, surroundings: Surroundings) -> None:
+        """Change the model; `surroundings` replace those of earlier calls."""
+        import mujoco
+
+        yaw, pitch = np.radians(surroundings.camera_turn)
+        turn, up = (np.array([np.cos(a / 2), 0, 0, 0]) for a in (yaw, pitch))
+        turn[2], up[1] = -np.sin(yaw / 2), np.sin(pitch / 2)  # MuJoCo's cameras: x right, y up
+        both, camera = np.empty(4), model.camera("front")
+        mujoco.mju_mulQuat(both, turn, up)
+        mujoco.mju_mulQuat(camera.quat, self.quat, both)
+        camera.pos[:] = self.eye + surroundings.camera_shift
+        model.light_pos[0] = self.lamp + surroundings.lamp_shift
+        for now, usual in zip(_light(model), self.light, strict=True):
+            now[:] = (1 + surroundings.room_light) * usual
+
+
+def _light(model: Any) -> tuple[np.ndarray, ...]:
+    head = model.vis.headlight
+    return model.light_diffuse, head.ambient, head.diffuse
