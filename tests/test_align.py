@@ -96,15 +96,10 @@ def test_prepared_data_pairs_touch_with_object_and_view() -> None:
 # ---- losses
 
 
-def random_batch() -> AlignedBatch:
-    generator = torch.Generator().manual_seed(0)
-    touch, text, image = F.normalize(torch.randn(3, 6, 8, generator=generator), dim=2)
-    label = torch.tensor([0, 0, 1, 1, 2, 3])
-    return AlignedBatch(touch, text, image, label != 0, label[:, None] == label)
-
-
 def test_paper_preset_is_equation_2_and_the_default_adds_image_to_text() -> None:
-    batch = random_batch()
+    generator, label = torch.Generator().manual_seed(0), torch.tensor([0, 0, 1, 1, 2, 3])
+    touch, text, image = F.normalize(torch.randn(3, 6, 8, generator=generator), dim=2)
+    batch = AlignedBatch(touch, text, image, label != 0, label[:, None] == label)
     c = batch.contact
     paper = batch_losses(batch, True, ALIGN_PRESETS["paper"])
     image = (batch.touch[c] @ batch.image[c].T / 0.2).log_softmax(1).diagonal().mean()

@@ -7,6 +7,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+import torch
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.media import read_frames
@@ -144,6 +145,17 @@ def test_a_policy_in_degrees_is_said() -> None:
     """Wrong shapes and NaN: test_deploy.py."""
     (trial,) = evaluate(Degrees, PickPlaceConfig(max_seconds=0.2), episodes=1).trials
     assert trial.clamped == 1 and "100% of the actions are beyond" in table([trial])
+
+
+def test_evaluation_leaves_torch_alone() -> None:
+    threads, state = torch.get_num_threads(), torch.get_rng_state()
+    torch.set_num_threads(threads + 1)
+    try:
+        evaluate("bead-maze", BeadMazeConfig(max_seconds=0.2), episodes=1)
+        assert torch.get_num_threads() == threads + 1
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 BLIND_ENV = PickPlaceConfig(cameras=(), tactile=False, max_seconds=0.5)

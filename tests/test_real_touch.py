@@ -10,7 +10,6 @@ import pytest
 
 from touchgoal.benchmarks.real_touch import forces, markers
 from touchgoal.benchmarks.real_touch.embedders import find_embedder
-from touchgoal.benchmarks.real_touch.forces import EmbeddedGrasp, cost_table, judge_cost
 from touchgoal.benchmarks.real_touch.videos import Config, run
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import load_encoder
@@ -140,20 +139,6 @@ def test_properties_of_unseen_objects_are_predicted() -> None:
     assert (predicted.ranks == ranks).mean() > 0.95
     shuffled = property_probe.predict_properties(rng.normal(size=(120, 6)), ranks, objects)
     assert (shuffled.ranks == ranks).mean() < 0.45  # chance, for no strength is chosen on them
-
-
-def test_the_cost_falls_with_the_touch_and_tells_the_wrong_object() -> None:
-    """Two objects with orthogonal embeddings; 0.5 N from the sixth frame on."""
-    strength = np.array([0, 0, 0, 0, 0, 0.4, 0.7, 1, 1, 1])
-
-    def grasp(trial: int) -> EmbeddedGrasp:
-        seen = strength[:, None] * np.eye(2)[trial // 2] + 0.01 * trial
-        return EmbeddedGrasp(f"object {trial // 2}", seen, 8, 5)
-
-    result = judge_cost([grasp(trial) for trial in range(4)])
-    assert result["delays"] == [0] * 4 and result["near"] == 1
-    assert result["auc"] == 1 and set(result["auc_of_pairs"]) == {"object 0", "object 1"}
-    assert "within 3 frames in 100 % of 4 pairs" in cost_table(result, "ours")
 
 
 def test_videos_of_other_objects_tell_what_differs_without_meaning() -> None:

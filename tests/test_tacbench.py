@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 import torch
 from in_process import in_process_workers
-from published_files import write_force_batch, write_pose_set
+from published_files import write_force_batch
 
 from touchgoal.benchmarks.papers.tacbench.benchmark import run
 from touchgoal.benchmarks.papers.tacbench.config import Config
 from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, read_strokes
 from touchgoal.benchmarks.papers.tacbench.force import field_metrics, force_metrics
 from touchgoal.benchmarks.papers.tacbench.labels import label_metrics
-from touchgoal.benchmarks.papers.tacbench.pose import PoseTask
-from touchgoal.benchmarks.papers.tacbench.published_recordings import find_published
 from touchgoal.benchmarks.papers.tacbench.slip import f1_score, slip_metrics
 from touchgoal.benchmarks.papers.tacbench.task import split_force, split_slip
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
@@ -27,7 +25,6 @@ from touchgoal.encoders.pretrained import save
 from touchgoal.encoders.probes.attentive import AttentivePooler
 from touchgoal.encoders.ssl.frames import sample_frames
 from touchgoal.episodes.bench_recording import record_bench
-from touchgoal.episodes.importers.tacbench_poses import read_bags
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import RigConfig
@@ -191,26 +188,6 @@ def test_metrics_of_labels_and_fields_by_hand() -> None:
     half[:, :, 20, 20] = 100.0
     assert field_metrics(half[None], field, np.arange(2))["shear_explained"] == pytest.approx(0.75)
     assert field_metrics(0 * half[None], field, np.arange(2))["pressure_explained"] == 0
-
-
-def test_bags_become_classes_of_their_motions(tmp_path: Path) -> None:
-    write_pose_set(tmp_path, bags=5, pictures=14, shape=(32, 24))
-    published = find_published(tmp_path, "gelsight_mini")
-    assert published is not None and published.sensor == "digit" and published.what == "slides"
-    frames = published.read(20, preprocessor_for("digit"))
-    task = PoseTask(frames)
-    changes = np.stack([bag.change for bag in read_bags(tmp_path)])
-    used = torch.cat([task.split.train, task.split.validation, *task.split.tests.values()])
-    bounds = np.array([-5, -2, -1, -0.5, -0.1, 0.1, 0.5, 1, 2, 5])
-    for row in used.tolist():
-        bag, moment = divmod(row, 14)
-        assert moment >= 10  # before that the motion, or the past, is not known
-        right = np.searchsorted(bounds, 1e3 * changes[bag, moment, 0], side="right")
-        assert task.classes[row, 0] == right
-    assert len(used) == 20 * 4
-    bags = np.unique(frames.stroke[task.split.tests["known objects"].numpy()])
-    assert bags.tolist() == list(range(10, 20))  # the published test bags
-    assert np.unique(frames.stroke[task.split.validation.numpy()]).tolist() == [4, 9]
 
 
 def test_published_files_are_benchmarked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
