@@ -95,14 +95,14 @@ def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
 def test_a_sentence_fits_its_object_alone() -> None:
     rng = np.random.default_rng(0)
     looks = [
-        Look(CATALOGUE[name], CATALOGUE[name].material.rgba[:3], painted=False)
+        Look(CATALOGUE[name], np.array(CATALOGUE[name].material.rgba[:3]), painted=False)
         for name in ("toy_brick", "brick", "golf_ball")
     ]
     said = [{sentence(rng, a, [b for b in looks if b is not a]) for _ in range(60)} for a in looks]
     assert not said[0] & said[1] and not said[0] & said[2]
     assert "the toy brick" in said[0] and "a white ball" in said[2]
     assert all("block" not in words or "red" in words for words in said[1] if words)
-    assert sentence(rng, looks[0], [looks[0]]) is None
+    assert sentence(rng, looks[0], [replace(looks[0]), replace(looks[0])]) is None
 
 
 def test_placements_say_where_each_object_is() -> None:

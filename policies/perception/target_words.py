@@ -37,7 +37,7 @@ _TEMPLATES = ("{}", "the {}", "the {}", "a {}", "pick up the {}")
 _DISTINCT = 0.25  # distance in RGB beyond which two colours are not confused
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Look:
     """An object as a person would name it."""
 
