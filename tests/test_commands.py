@@ -5,11 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from in_process import in_process_workers
 from toy_episodes import record
 
 from touchgoal.benchmarks.papers.reward_quality import benchmark, recording
+from touchgoal.control import features as ft
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS
@@ -17,6 +19,7 @@ from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import COMMANDS, main, usage
 from touchgoal.policies import checkpoint
+from touchgoal.sim_envs.config import PickPlaceConfig
 
 pytestmark = pytest.mark.usefixtures("in_process")
 
@@ -177,6 +180,30 @@ def test_learning_to_pick_and_place(
     assert "the policy succeeded in 0/1" in capsys.readouterr().out
     found = EpisodeSet(Path("demos/episodes"))
     assert [found.meta(i)["outcome"] for i in range(2)] == ["success", "corrected"]
+
+
+@pytest.mark.slow
+def test_from_recordings_with_cameras_to_a_policy_that_sees(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    record = ("collect-demos", "--episodes", 1, "--env.control-hz", 10, "--env.no-tactile", "--env.camera-size", 64, 64,
+              "--workers", 1)  # fmt: skip
+    run(*record, "--out", "demos")
+    run(*record, "--seed", 1, "--out", "val")
+    learn = ("train-policy", "--data", "demos", "--validation", "val", "--workers", 1, "--head", "tiny",
+             "--representation", "base_twist", "--train.epochs", 1, "--trials", 0)  # fmt: skip
+    assert "its cameras: observation.images.front" in refused(capsys, *learn, "--cameras", "top")
+    run(*learn, "--cameras", "front", "wrist", "--out", "policy")
+    policy = checkpoint.load_policy("policy")
+    env = policy.env_config(PickPlaceConfig(control_hz=10))
+    assert env.cameras == ("front", "wrist") and env.camera_size == (64, 64) and not env.tactile
+    recorded = EpisodeSet(Path("demos/episodes")).read(0).frames
+    seen = {key: values[0] for key, values in recorded.items()}
+    moved = policy.act(seen)
+    policy.reset()
+    blind = policy.act(seen | {ft.FRONT: np.zeros_like(seen[ft.FRONT])})
+    assert moved.shape == (8,) and not np.array_equal(moved, blind)
 
 
 @pytest.mark.slow

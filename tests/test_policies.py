@@ -24,6 +24,7 @@ from touchgoal.policies.evaluation.report import film_trials
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.evaluation.table import table
 from touchgoal.policies.heads.diffusion import DiffusionConfig
+from touchgoal.policies.perception.frozen_images import ImageEmbedder, ImageInputConfig
 from touchgoal.policies.training.training_data import choose_episodes, common_sensor, find_task
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
@@ -238,6 +239,17 @@ def test_the_films_show_the_trials(tmp_path: Path) -> None:
     frames, fps = read_frames(tmp_path / "worst.mp4")
     assert fps == 10 and len(frames) == 6
     assert sorted(p.name for p in tmp_path.iterdir()) == ["best.mp4", "worst.mp4"]
+
+
+def test_a_tick_embeds_like_its_episode_and_another_size_is_refused() -> None:
+    images = np.random.default_rng(0).integers(0, 256, (5, 64, 96, 3), np.uint8)
+    embedder = ImageEmbedder(ImageInputConfig((ft.FRONT, ft.WRIST), (64, 96)))
+    together = embedder._maps(images)
+    alone = embedder.embed_tick({ft.FRONT: images[4], ft.WRIST: images[0]})
+    assert alone.shape == embedder.shape == (2, 112, 14, 21)
+    np.testing.assert_allclose(alone, together[[4, 0]], atol=2e-2)
+    with pytest.raises(UserError, match="camera images are 64 x 64, the policy reads 64 x 96"):
+        embedder.embed_tick({ft.FRONT: images[0, :, :64], ft.WRIST: images[0]})
 
 
 def test_the_shipped_maze_policy_knows_no_truth_of_the_simulator() -> None:

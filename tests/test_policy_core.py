@@ -257,12 +257,6 @@ def test_unet_is_the_published_one() -> None:
     with torch.device("meta"):
         published = UNet(PRESETS["published"], 7, 1550)
     assert sum(p.numel() for p in published.parameters()) == 87_439_623
-    small = UNet(PRESETS["tiny"], 7, 5)
-    chunk, step, condition = torch.randn(3, 8, 7), torch.tensor([0.0, 50.0, 99.0]), torch.ones(3, 5)
-    out = small(chunk, step, condition)
-    assert out.shape == chunk.shape
-    assert not torch.allclose(small(chunk, step + 1, condition), out, atol=1e-5)
-    assert not torch.allclose(small(chunk, step, condition + 1), out, atol=1e-5)
 
 
 def exact_flow(x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:

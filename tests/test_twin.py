@@ -65,14 +65,17 @@ def moves(address: str, home: list[float]) -> dict:
     settle()
     fell = pose - np.array(robot.state.O_T_EE.translation)
     robot.move(franky.JointMotion(home))
-    held = np.inf
-    stiffness = np.array([600, 600, 600, 600, 250, 150, 50.0])
-    with franky.JointImpedanceTracker(robot, stiffness=stiffness) as tracker:
+    before = np.array(robot.state.q)
+    robot.move(franky.JointVelocityMotion([0.2, 0, 0, 0, 0, 0, 0], franky.Duration(300)))
+    turned = np.array(robot.state.q) - before
+    held, stiffness = np.inf, np.array([600, 600, 600, 600, 250, 150, 50.0])
+    with franky.JointImpedanceTracker(robot, stiffness=stiffness) as tracker:  # torques
         tracker.set_target(np.array(home), np.zeros(7))
         settle(0.5)
         held = float(np.abs(np.array(robot.state.q) - home).max())
     far = refused(np.array([2.9, *home[1:]]))
-    return {"panda": panda, "far": far, "errors": errors, "held": held, "fell": fell.tolist()}
+    ways = {"fell": fell.tolist(), "turned": turned.tolist(), "held": held}
+    return {"panda": panda, "far": far, "errors": errors, **ways}
 
 
 @pytest.mark.realtime
@@ -83,6 +86,7 @@ def test_franka_holds_clients_to_its_limits(fr3: RunningTwin) -> None:
     assert "joint_motion_generator_" in result["far"] and "limits_violation" in result["far"]
     assert max(result["errors"]) < 2e-3
     np.testing.assert_allclose(result["fell"], [0, 0, 0.03], atol=2e-3)
+    assert 0.05 < result["turned"][0] < 0.07 and np.abs(result["turned"][1:]).max() < 3e-3
     assert result["held"] < 0.02
     worst = fr3.ask("truth")["worst"]
     assert worst["excess"] <= 0 and worst["speed"] < 1
