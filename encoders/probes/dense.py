@@ -10,27 +10,26 @@ from torch import Tensor, nn
 
 from touchgoal.runtime.errors import UserError
 
+_WIDTH = 48  # channels between the tokens and the planes
+
 
 class DenseProbe(nn.Module):
     """Probe from the tokens of a grid of patches to planes of values."""
 
-    def __init__(
-        self, features: int, grid: tuple[int, int], planes: int, side: int, width: int = 48
-    ) -> None:
+    def __init__(self, features: int, grid: tuple[int, int], planes: int, side: int) -> None:
         """Build a randomly initialised probe.
 
         Args:
             grid: Rows and columns of the patches. Tokens before them (a class token) are dropped;
                 several times as many (clips) are averaged over time.
             side: Rows and columns of the output.
-            width: Channels in between.
         """
         super().__init__()
         self.grid, self.side = grid, side
         self.norm = nn.LayerNorm(features)
-        self.narrow = nn.Linear(features, width)
-        self.refine = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(2))
-        self.out = nn.Conv2d(width, planes, 3, padding=1)
+        self.narrow = nn.Linear(features, _WIDTH)
+        self.refine = nn.ModuleList(nn.Conv2d(_WIDTH, _WIDTH, 3, padding=1) for _ in range(2))
+        self.out = nn.Conv2d(_WIDTH, planes, 3, padding=1)
 
     def forward(self, tokens: Float[Tensor, "b t f"]) -> Float[Tensor, "b p s s"]:
         """Return the planes, unbounded; UserError for fewer tokens than patches."""

@@ -21,10 +21,8 @@ from touchgoal.runtime.errors import UserError
 
 BATCH = 32
 _CPU_PICTURES = 4  # a larger batch of EfficientNet's activations leaves the cache: 30 % slower
+_SIDE = 224  # px, shorter side of an image for the ImageNet network
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-# OpenAI CLIP's, of every CLIPModel checkpoint
-_CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
-_CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 T = TypeVar("T")
 _HASH_SUFFIX = re.compile(r"#[0-9a-f]{12}$")
 
@@ -163,10 +161,14 @@ class ClipTowers:
         """Load the model, a folder without network access; UserError if there is no CLIP."""
         self._model = load_model(source, "CLIPModel", "clip", device)
         from transformers import AutoTokenizer
+        from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
 
         self._tokenizer = load_part(source, AutoTokenizer)
         self.device = device
-        self.image_size: int = self._model.config.vision_config.image_size
+        side = self._model.config.vision_config.image_size
+        self._processor: Any = CLIPImageProcessorPil(
+            size={"shortest_edge": side}, crop_size={"height": side, "width": side}
+        )
         self._context: int = self._model.config.text_config.max_position_embeddings
         self.image_dim = self.text_dim = int(self._model.config.projection_dim)
         self.name = f"{source}#{_weights_hash(self._model)}"
@@ -176,9 +178,9 @@ class ClipTowers:
         """Return projected embeddings of the centre square."""
 
         def embed(batch: np.ndarray) -> Tensor:
-            pixels = clip_pixels(batch, self.image_size).to(self.device)
+            pixels = self._processor(images=list(batch), return_tensors="pt").to(self.device)
             # transformers 5: the projected vector is the output's pooler_output
-            return self._model.get_image_features(pixel_values=pixels).pooler_output.cpu()
+            return self._model.get_image_features(**pixels).pooler_output.cpu()
 
         return _joined(_in_batches(embed, images), self.image_dim)
 
@@ -199,32 +201,19 @@ class ClipTowers:
 
 def imagenet_pixels(images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n 3 y x"]:
     """Return the whole image with a shorter side of 224, normalised as for ImageNet."""
-    return _normalised(_resize_shorter_side(images, 224), _IMAGENET_MEAN, _IMAGENET_STD)
+    h, w = images.shape[1:3]
+    shape = (_SIDE, int(_SIDE * h / w)) if w <= h else (int(_SIDE * w / h), _SIDE)
+    resized = [Image.fromarray(i).resize(shape, Image.Resampling.BICUBIC) for i in images]
+    pixels = torch.tensor(np.stack([np.asarray(image) for image in resized]))
+    return imagenet_normalised(pixels.permute(0, 3, 1, 2) / 255)
 
 
 def imagenet_normalised(pixels: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n 3 y x"]:
     """Normalise pixels of 0 to 1 as for ImageNet."""
-    return _normalised(pixels, _IMAGENET_MEAN, _IMAGENET_STD)
-
-
-def clip_pixels(images: UInt8[np.ndarray, "n h w 3"], size: int) -> Float[Tensor, "n 3 y x"]:
-    """Return the centre square, as transformers' CLIPImageProcessorPil makes it."""
-    pixels = _resize_shorter_side(images, size)
-    top, left = (pixels.shape[2] - size) // 2, (pixels.shape[3] - size) // 2
-    square = pixels[:, :, top : top + size, left : left + size]
-    return _normalised(square, _CLIP_MEAN, _CLIP_STD)
-
-
-def _resize_shorter_side(images: np.ndarray, size: int) -> Tensor:
-    h, w = images.shape[1:3]
-    shape = (size, int(size * h / w)) if w <= h else (int(size * w / h), size)
-    resized = [Image.fromarray(i).resize(shape, Image.Resampling.BICUBIC) for i in images]
-    pixels = torch.tensor(np.stack([np.asarray(image) for image in resized]))
-    return pixels.permute(0, 3, 1, 2) / 255
-
-
-def _normalised(pixels: Tensor, mean: tuple[float, ...], std: tuple[float, ...]) -> Tensor:
-    mean, std = (torch.tensor(v, device=pixels.device)[:, None, None] for v in (mean, std))
+    mean, std = (
+        torch.tensor(values, device=pixels.device)[:, None, None]
+        for values in (_IMAGENET_MEAN, _IMAGENET_STD)
+    )
     return (pixels - mean) / std
 
 
@@ -238,7 +227,7 @@ def _on_all_cores(embed: Callable[[np.ndarray], T], images: np.ndarray, size: in
         with ThreadPoolExecutor(threads, initializer=lambda: torch.set_num_threads(1)) as pool:
             return list(pool.map(embed, batches))
     finally:
-        torch.set_num_threads(threads)  # for threads yet to come; this one's was never changed
+        torch.set_num_threads(threads)  # for later threads; this thread's number did not change
 
 
 def _in_batches(embed: Callable[[Any], T], items: Any, size: int = BATCH) -> list[T]:

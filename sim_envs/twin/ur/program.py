@@ -208,8 +208,8 @@ class UrProgram:
 
     def _execute(self, command: int) -> None:
         actions = {
-            1: lambda: self._move(_JointMove(self._doubles(0), *self._pace())),
-            3: lambda: self._move(_LineMove(self.cell, self._doubles(0), *self._pace())),
+            1: lambda: self._move(_JointMove(self._goal(), *self._pace())),
+            3: lambda: self._move(_LineMove(self.cell, self._goal(), *self._pace())),
             8: self._zero_force,
             11: self._servo,
             15: lambda: self._stop(asynchronous=False),
@@ -244,7 +244,7 @@ class UrProgram:
         self.ints[0] = _DONE
 
     def _servo(self) -> None:
-        goal = self._doubles(0)
+        goal = self._goal()
         if not np.isfinite(goal).all():
             self._protective_stop()
             return
@@ -279,5 +279,5 @@ class UrProgram:
     def _double(self, index: int) -> float:
         return float(self.inputs[f"input_double_register_{index}"])
 
-    def _doubles(self, index: int) -> Float[np.ndarray, "6"]:
-        return np.array([self._double(index + i) for i in range(6)])
+    def _goal(self) -> Float[np.ndarray, "6"]:
+        return np.array([self._double(i) for i in range(6)])
