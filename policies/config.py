@@ -100,9 +100,11 @@ class PoseEstimatorConfig:
     size: tuple[Count, Count] = (256, 256)
     """Rows and columns of the camera images, px. With half as many a pixel covers 5 mm of the
     table, and objects are located to 3 mm at best."""
-    crops: tuple[tuple[str, Box], ...] = ((ft.FRONT, (104, 232, 16, 240)),)
+    crops: tuple[tuple[str, Box], ...] = ((ft.FRONT, (80, 256, 0, 256)),)
     """Crop of each camera's images that shows the table: column of the episodes, then rows and
     columns (from, to; from, to), px."""
+    scene_keypoints: Count = 16
+    """Keypoints of the whole image at half its size, which show how the camera stands."""
     finder_channels: Count = 48
     """Feature maps of the first look, which finds object and goal; cells of 8 x 8 pixels."""
     look: Count = 64
@@ -125,7 +127,7 @@ class PoseEstimatorConfig:
 class PoseTrainConfig:
     """Training of the pose estimator, by AdamW."""
 
-    epochs: Count = 14
+    epochs: Count = 16
     """Passes over the placements."""
     batch_size: Count = 64
     """Placements in each step."""

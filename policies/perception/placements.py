@@ -15,9 +15,11 @@ from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
+from touchgoal.sim_envs.surroundings import USUAL, UsualScene, draw
 
 MOST = 4  # objects on the table
 _ALONE = 0.4  # share of the placements with one object
+_USUAL = 0.3  # share of the placements with camera and light as they usually are
 _COLOUR_NOISE = 0.04  # standard deviation of a painted colour, of [0, 1]
 
 
@@ -48,14 +50,16 @@ def render_placements(
     seed: int,
     workers: int,
     painted: float = 0.5,
+    usual: float = _USUAL,
 ) -> Placements:
     """Render scenes of objects of random shape and size, each at several places.
 
-    Seeds count up from `seed`. The share `painted` of the objects has another colour than its kind.
+    Seeds count up from `seed`. The share `painted` of the objects has another colour than its kind;
+    the share `usual` of the placements has camera and light as they usually are.
     """
     config = replace(config, distractors=MOST - 1)
     seeds = range(seed, seed + scenes)
-    render = partial(_render_scene, config, placements_each, painted)
+    render = partial(_render_scene, config, placements_each, painted, usual)
     with parallel_map(render, seeds, workers) as rendered:
         rows = [row for some in track(rendered, "rendering", "scene", total=scenes) for row in some]
     sentences = sorted({words for row in rows for words in row["words"] if words})
@@ -77,12 +81,15 @@ def _column(rows: list[dict[str, Any]], key: str) -> Tensor:
 
 
 def _render_scene(
-    config: PickPlaceConfig, placements_each: int, painted: float, seed: int
+    config: PickPlaceConfig, placements_each: int, painted: float, usual: float, seed: int
 ) -> list[dict[str, Any]]:
     env = PickPlace(config)
     env.reset(seed=seed)
     rng = env.np_random.spawn(1)[0]
-    rows = [_render_placement(env, rng, painted) for _ in range(placements_each)]
+    scene, rows = UsualScene.of(env.model), []
+    for _ in range(placements_each):
+        scene.change(env.model, draw(rng) if rng.random() > usual else USUAL)
+        rows.append(_render_placement(env, rng, painted))
     env.close()
     return rows
 

@@ -4,6 +4,7 @@ It looks twice: a coarse map scores where the named object and the goal are; a c
 full resolution, gives their poses.
 """
 
+from dataclasses import replace
 from typing import cast
 
 import torch
@@ -25,6 +26,7 @@ _CELL = 8  # px between two cells of a finder's map
 _PEAK = 1.5  # cells around a map's maximum over which the place is averaged
 # Centre of the first cell, px: that of the 8 pixels of its patch, which begin at -2.
 _FIRST = 1.5
+_BRIGHTNESS, _MOST_GAIN = 110.0, 6.0  # grey levels of 255, the mean of the usual image
 
 Pictures = dict[str, UInt8[Tensor, "b h w 3"]]
 Places = dict[str, Float[Tensor, "b 2 2"]]
@@ -42,7 +44,15 @@ class PoseEstimator(nn.Module):
         self.looks = nn.ModuleList(
             nn.ModuleList(_SpatialSoftmax(config) for _ in _PARTS) for _ in config.crops
         )
-        width = _TCP + config.keypoints * (2 + config.keypoint_features) * len(config.crops)
+        half = replace(
+            config,
+            look=min(config.size) // 2,
+            keypoints=config.scene_keypoints,
+            dilations=config.dilations[::2],
+        )
+        self.scenes = nn.ModuleList(_SpatialSoftmax(half) for _ in config.crops)
+        points = (config.keypoints + config.scene_keypoints) * len(config.crops)
+        width = _TCP + points * (2 + config.keypoint_features)
         self.tcp_normalizer, self.start_normalizer = Normalizer((_TCP,)), Normalizer((_START,))
         self.heads = nn.ModuleList(_head(width, config.width, part) for part in _PARTS)
 
@@ -53,6 +63,7 @@ class PoseEstimator(nn.Module):
 
         `words` are `target_words.embed`; zeros without a sentence, where one object is there.
         """
+        pictures = evenly_lit(pictures)
         scores = self.scores(pictures, words)
         places = {key: _find(scores[key], box) for key, box in self.config.crops}
         return self.start_normalizer.inverse(self.scaled(pictures, tcp, places))
@@ -74,14 +85,29 @@ class PoseEstimator(nn.Module):
         self, pictures: Pictures, tcp: Float[Tensor, "b 7"], places: Places
     ) -> Float[Tensor, "b 7"]:
         """Return the estimate from crops around these places, normalised to variance 1."""
+        known = [self.tcp_normalizer(tcp)]
+        for (key, _), scene in zip(self.config.crops, self.scenes, strict=True):
+            halved = pictures[key][:, ::2, ::2]
+            middle = torch.tensor(halved.shape[1:3], device=tcp.device) / 2
+            known.append(scene(halved, middle.expand(len(halved), -1)))
         estimate = []
         for part, head in enumerate(self.heads):
-            found = [self.tcp_normalizer(tcp)]
+            found = list(known)
             for (key, _), looks in zip(self.config.crops, self.looks, strict=True):
                 look = cast(nn.ModuleList, looks)[part]
                 found.append(look(pictures[key], places[key][:, part]))
             estimate.append(head(torch.cat(found, 1)))
         return torch.cat(estimate, 1)
+
+
+def evenly_lit(pictures: Pictures) -> Pictures:
+    """Return images of the same mean brightness, by a gain of at most 6."""
+    lit = {}
+    for key, some in pictures.items():
+        mean = some[:, ::4, ::4].float().mean((1, 2, 3), keepdim=True)
+        gain = (_BRIGHTNESS / mean).clamp(0.5, _MOST_GAIN)
+        lit[key] = (some * gain).clamp(max=255).to(torch.uint8)
+    return lit
 
 
 def _head(inputs: int, width: int, outputs: int) -> nn.Sequential:

@@ -15,7 +15,7 @@ from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.policies.config import Box, PoseTrainConfig
 from touchgoal.policies.perception.placements import Placements
-from touchgoal.policies.perception.pose_estimator import PoseEstimator
+from touchgoal.policies.perception.pose_estimator import PoseEstimator, evenly_lit
 from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
 
 _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose counts linearly
@@ -43,12 +43,14 @@ def train_pose_estimator(
         target = (noise.rand((len(rows),)) * placements.objects[rows]).long()
         words, unambiguous = _words(placements, embedded, rows, target, noise)
         return {
-            "pictures": {
-                key: _add_pixel_noise(
-                    placements.pictures[key][rows], box, config.pixel_noise, noise
-                )
-                for key, box in estimator.config.crops
-            },
+            "pictures": evenly_lit(
+                {
+                    key: _add_pixel_noise(
+                        placements.pictures[key][rows], box, config.pixel_noise, noise
+                    )
+                    for key, box in estimator.config.crops
+                }
+            ),
             "tcp": placements.tcp[rows],
             "start": placements.start[rows, target],
             "places": _places(placements, rows, target),
