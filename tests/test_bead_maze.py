@@ -128,3 +128,17 @@ def test_drop_and_jam(maze: BeadMaze) -> None:
     env.reset(seed=0)
     *_, info = [env.step(STILL) for _ in range(22)][-1]
     assert info[ft.TRUTH_FAILURE].tolist() == [False, True, False]
+
+
+def test_bead_stays_on_the_wire_whatever_the_hand_does(maze: BeadMaze) -> None:
+    maze.reset(seed=0)
+    maze.action_space.seed(0)
+    pressed = False
+    for _ in range(40):
+        action = maze.action_space.sample()
+        action[7] = 0.0
+        *_, info = maze.step(action)
+        pressed |= info[ft.TRUTH_FAILURE][2]
+        point, _ = maze.wire.at(maze.wire.project(maze.object_pose()[:3], maze.arc_length))
+        assert np.linalg.norm(maze.object_pose()[:3] - point) < 2e-3
+    assert pressed

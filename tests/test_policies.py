@@ -10,11 +10,13 @@ import pytest
 import torch
 
 from touchgoal.control import features as ft
+from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
+from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.by_name import prepare_policy
 from touchgoal.policies.checkpoint import EPISODE_OBJECT, load_policy
@@ -148,15 +150,24 @@ def test_a_policy_in_degrees_is_said() -> None:
     assert trial.clamped == 1 and "100% of the actions are beyond" in table([trial])
 
 
-def test_evaluation_leaves_torch_alone() -> None:
+def test_evaluation_leaves_torch_alone_and_reads_weights_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    read, load_weights = [], WeightsFormat.load_weights
+    monkeypatch.setattr(
+        WeightsFormat, "load_weights", lambda f, *a: read.append(f.stem) or load_weights(f, *a)
+    )
+    checkpoint._load_network.cache_clear()
+    checkpoint._load_parts.cache_clear()
     threads, state = torch.get_num_threads(), torch.get_rng_state()
     torch.set_num_threads(threads + 1)
     try:
-        evaluate("bead-maze", BeadMazeConfig(max_seconds=0.2), episodes=1)
+        evaluate("bead-maze", BeadMazeConfig(max_seconds=0.2), episodes=2)
         assert torch.get_num_threads() == threads + 1
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(torch.get_rng_state(), state)
+    assert sorted(read) == ["encoder", "policy"]
 
 
 BLIND_ENV = PickPlaceConfig(cameras=(), tactile=False, max_seconds=0.5)
