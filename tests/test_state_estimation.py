@@ -1,5 +1,6 @@
 """Estimators and the feedback expert: what a policy learns on, and what corrects it."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from touchgoal.policies.perception.state_estimation import ESTIMATED, StateEstim
 from touchgoal.policies.perception.target_words import Look, embed, sentence
 from touchgoal.policies.training.dagger import DaggerRoles
 from touchgoal.runtime import seeds
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE
@@ -66,6 +68,19 @@ def test_contact_is_the_simulators_in_every_tick() -> None:
     estimator.estimate(ticks[40], ticks[0])
     again = ticks[0] | {}  # another episode begins
     assert not estimator.estimate(again, again)[ft.TRUTH_CONTACT].any()
+
+
+def test_a_hand_that_starts_elsewhere_than_in_training_is_refused() -> None:
+    network = PoseEstimator(SMALL).eval()
+    hands = np.array([0.45, 0, 0.26, 0, 1, 0, 0]) + [[0.03], [-0.03]] * np.eye(1, 7)
+    network.tcp_normalizer.fit_mean_std(torch.from_numpy(hands).float())
+    first = dict.fromkeys((ft.FRONT, *ft.TACTILE), np.zeros((32, 32, 3), np.uint8))
+    for x, refused in ((0.5, False), (0.62, True)):
+        tick = first | {ft.TCP_POSE: np.array([x, 0, 0.26, 0, 1, 0, 0], np.float32)}
+        with (
+            pytest.raises(UserError, match="near .0.45, 0.0, 0.26. m") if refused else nullcontext()
+        ):
+            StateEstimator(network)._begin(tick)
 
 
 def train_pose(

@@ -24,6 +24,7 @@ from touchgoal.runtime.errors import UserError
 ESTIMATOR_FORMAT = WeightsFormat(
     "estimator", "pose estimator", "train one with: touchgoal train-pose-estimator"
 )
+_FARTHEST = 4.0  # standard deviations of the hand's start in training
 ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 
 
@@ -63,10 +64,22 @@ class StateEstimator:
         """Begin an episode: estimate its poses, take its untouched gels."""
         pictures = {key: self._picture(key, first[key]) for key in self.cameras}
         tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
+        self._check_hand(tcp)
         words = embed([self.target]) if self.target else torch.zeros(1, WORDS_WIDTH)
         self._start = self.pose_estimator(pictures, tcp, words)[0].numpy()
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
         self._first = first
+
+    def _check_hand(self, tcp: Float32[Tensor, "1 7"]) -> None:
+        """Refuse a start from where the hand was not in training: it would pass for a moved camera."""
+        away = self.pose_estimator.tcp_normalizer(tcp)[0, :3]
+        if away.abs().max() > _FARTHEST:
+            usual = self.pose_estimator.tcp_normalizer.inverse(torch.zeros(7))[:3].tolist()
+            x, y, z = (round(v, 2) + 0.0 for v in usual)  # -0.0 becomes 0.0
+            raise UserError(
+                f"the policy must start with the hand near ({x}, {y}, {z}) m, where its pose "
+                "estimator was trained: move it there (task.start of a cell file)"
+            )
 
     def _picture(self, key: str, picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[Tensor, "1 h w 3"]:
         size = self.camera_size
