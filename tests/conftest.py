@@ -44,6 +44,13 @@ def in_process() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of the test's own, in which it stands."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
 @pytest.fixture(scope="module")
 def fr3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
     """An FR3 that waits for its client, so that runs repeat."""

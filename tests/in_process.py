@@ -1,4 +1,4 @@
-"""Workers that are no processes: what a pool would be given is done here, one after the other."""
+"""Commands, and workers that are no processes: what a pool would be given is done here, in order."""
 
 import pickle
 from collections.abc import Callable, Iterator
@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from touchgoal.launch.__main__ import main
 from touchgoal.runtime.parallel import worker_pool
 
 
@@ -30,3 +31,7 @@ def in_process_workers() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(worker_pool, "ProcessPoolExecutor", lambda *_, **__: _InProcess())
         yield
+
+
+def run(*arguments: object) -> None:
+    main([str(a) for a in arguments])

@@ -20,9 +20,6 @@ class S3Server(LocalServer):
 class _Handler(LocalHandler):
     server: S3Server  # pyright: ignore[reportIncompatibleVariableOverride]  # its only server
 
-    def do_HEAD(self) -> None:
-        self.do_GET()
-
     def do_GET(self) -> None:
         address = urlsplit(self.path)
         bucket, _, key = unquote(address.path).strip("/").partition("/")
@@ -36,6 +33,8 @@ class _Handler(LocalHandler):
             self._send_file(path)
         else:
             self.send(404, _error("NoSuchKey", "The specified key does not exist"))
+
+    do_HEAD = do_GET
 
     def _list(self, bucket: str, prefix: str) -> None:
         folder = self.server.root / bucket

@@ -27,8 +27,6 @@ DESCRIPTIONS = {
     "cloth": ["a soft woven cloth", "soft", "loose threads crossing"],
 }
 CONFIG = AlignConfig(backbone="vit-tiny", embedding_dim=16, epochs=3, batch_size=16, lr=3e-3)
-
-
 SENSOR, FRESH = "gelsight_mini", TrainerOptions()
 
 
@@ -75,9 +73,6 @@ def make_touches(per_episode: int, seed: int, per_object: int = 1) -> Touches:
 TRAIN, VAL = make_touches(12, 0), make_touches(6, 1, per_object=4)
 
 
-# ---- data
-
-
 def test_prepared_data_pairs_touch_with_object_and_view() -> None:
     data = prepare_touch_data(TRAIN, PaintTowers(), "gelsight_mini", CONFIG.no_contact_texts)
     assert data.names == ("", "ball", "brush", "cloth")
@@ -93,9 +88,6 @@ def test_prepared_data_pairs_touch_with_object_and_view() -> None:
         prepare_touch_data(unnamed, PaintTowers(), SENSOR, CONFIG.no_contact_texts)
 
 
-# ---- losses
-
-
 def test_paper_preset_is_equation_2_and_the_default_adds_image_to_text() -> None:
     generator, label = torch.Generator().manual_seed(0), torch.tensor([0, 0, 1, 1, 2, 3])
     touch, text, image = F.normalize(torch.randn(3, 6, 8, generator=generator), dim=2)
@@ -108,9 +100,6 @@ def test_paper_preset_is_equation_2_and_the_default_adds_image_to_text() -> None
     three = batch_losses(batch, False, replace(CONFIG, text_weight=0.5, image_text_weight=0.25))
     weighted = 0.5 * three["loss_touch_text"] + 0.25 * three["loss_image_text"]
     torch.testing.assert_close(three["loss"], weighted + three["loss_touch_image"])
-
-
-# ---- training
 
 
 def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
@@ -139,9 +128,6 @@ def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> No
     metrics = json.loads((tmp_path / "metrics.jsonl").read_text())
     assert metrics["touch_to_image_loss"] >= metrics["touch_to_image_floor"] - 1e-4
     assert "contact_accuracy" not in metrics
-
-
-# ---- retrieval metrics
 
 
 def as_felt(view: torch.Tensor, label: torch.Tensor) -> tuple[TouchEncoder, TouchData]:

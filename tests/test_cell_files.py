@@ -47,13 +47,12 @@ def test_a_target_reaches_the_policy_or_is_refused() -> None:
     assert deployed is not None and cast(LearnedPolicy, deployed.planner).target == "a red block"
 
 
-def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_an_example_is_found_by_its_name(here: Path) -> None:
     for name in ("sim", "sim.toml", "control/cell/examples/sim.toml"):
         assert find_cell_file(Path(name)) == EXAMPLES / "sim.toml"
     with pytest.raises(UserError, match="no cell file mine.toml.*fr3_two_minis, sim, sim_maze"):
         find_cell_file(Path("mine.toml"))
-    (tmp_path / "sim.toml").write_text(SIM)
+    (here / "sim.toml").write_text(SIM)
     assert find_cell_file(Path("sim.toml")) == Path("sim.toml")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from in_process import in_process_workers
+from in_process import in_process_workers, run
 from toy_episodes import record
 
 from touchgoal.benchmarks.papers.reward_quality import benchmark, recording
@@ -17,15 +17,11 @@ from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBack
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch.__main__ import COMMANDS, main, usage
+from touchgoal.launch.__main__ import COMMANDS, usage
 from touchgoal.policies import checkpoint
 from touchgoal.sim_envs.config import PickPlaceConfig
 
 pytestmark = pytest.mark.usefixtures("in_process")
-
-
-def run(*arguments: object) -> None:
-    main([str(a) for a in arguments])
 
 
 def refused(capsys: pytest.CaptureFixture, *arguments: object) -> str:
@@ -105,11 +101,8 @@ def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
 
 
 @pytest.mark.slow
-def test_learning_the_bead_maze(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_learning_the_bead_maze(here: Path, capsys: pytest.CaptureFixture) -> None:
     """The commands from demonstrations to a policy, at toy size."""
-    monkeypatch.chdir(tmp_path)
     one = ("--workers", 1)
     record = ("collect-demos", "--task", "bead-maze", "--episodes", 1, "--env.cameras",
               "--env.disturbance", 0, *one)  # fmt: skip
@@ -155,11 +148,8 @@ def test_learning_the_bead_maze(
 
 
 @pytest.mark.slow
-def test_learning_to_pick_and_place(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_learning_to_pick_and_place(here: Path, capsys: pytest.CaptureFixture) -> None:
     """The commands from placements to a corrected policy, at toy size."""
-    monkeypatch.chdir(tmp_path)
     one, blind = ("--workers", 1), ("--env.no-tactile", "--env.cameras", "--out", "demos")
     run("train-pose-estimator", *one, "--scenes", 2, "--placements", 2, "--train.epochs", 1,
         "--out", "est")  # fmt: skip
@@ -184,9 +174,8 @@ def test_learning_to_pick_and_place(
 
 @pytest.mark.slow
 def test_from_recordings_with_cameras_to_a_policy_that_sees(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+    here: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     record = ("collect-demos", "--episodes", 1, "--env.control-hz", 10, "--env.no-tactile", "--env.camera-size", 64, 64,
               "--workers", 1)  # fmt: skip
     run(*record, "--out", "demos")
@@ -207,10 +196,7 @@ def test_from_recordings_with_cameras_to_a_policy_that_sees(
 
 
 @pytest.mark.slow
-def test_a_shipped_policy_is_made_by_one_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_shipped_policy_is_made_by_one_command(here: Path, capsys: pytest.CaptureFixture) -> None:
     make = "make-policy --demonstrations 2 --corrections 1 --rounds 1 --epochs 1 --trials 0 --workers 1 --out made"
     run(*make.split())
     recipe = json.loads(Path("made/policy/policy/recipe.json").read_text())

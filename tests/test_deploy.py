@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_cell import SIM, FakeCell, write_cell_file
+from in_process import run
 from running_twin import RunningTwin
 
 from touchgoal.control import features as ft
@@ -34,10 +35,6 @@ from touchgoal.launch.deploy import NOT_DONE, STOPPED
 from touchgoal.launch.twin import open_to_network
 
 _PATIENCE = 600  # s for a loop, on a machine however loaded
-
-
-def run(*arguments: object) -> None:
-    main([str(a) for a in arguments])
 
 
 def deploying(twin: RunningTwin, out: Path) -> "subprocess.Popen[str]":
@@ -221,9 +218,6 @@ def test_a_twin_beyond_loopback_says_that_the_network_can_drive_it() -> None:
         assert not open_to_network(host)
     for host in ("0.0.0.0", "192.168.1.7", "robot-pc"):
         assert "any computer there can drive this arm" in open_to_network(host)
-
-
-# ---- `touchgoal arm`
 
 
 START = FR3.arm.home + 0.1 * np.eye(7)[0]  # rad: elsewhere than where the twin begins

@@ -38,20 +38,11 @@ from touchgoal.runtime.parallel.worker_pool import one_core_workers
 
 Shell = Callable[[list[str]], int]
 ALL = list(commands())
-SNIPPET_PAGES = [page for page in PAGES if snippets(page)]
-SHELL = [sys.executable, "-m", "touchgoal.launch"]
 
 
-def by_line(command: Command) -> str:
-    return f"{command.page}: {command.line}"
-
-
-@pytest.mark.parametrize("command", ALL, ids=by_line)
-def test_command_is_understood(
-    command: Command, capsys: pytest.CaptureFixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_box(tmp_path / "mug.obj", (0.08, 0.05, 0.06))  # which docs/own_object.md names
+@pytest.mark.parametrize("command", ALL, ids=lambda c: f"{c.page}: {c.line}")
+def test_command_is_understood(command: Command, capsys: pytest.CaptureFixture, here: Path) -> None:
+    write_box(here / "mug.obj", (0.08, 0.05, 0.06))  # which docs/own_object.md names
     words = command.words
     if words[0] == "make":
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
@@ -73,10 +64,7 @@ TARGETS = "demo weights weights-markers maze-policy maze-wrench-policy pick-plac
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_recipes_of_the_makefile_are_understood(
-    target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_recipes_of_the_makefile_are_understood(target: str, here: Path) -> None:
     assert recipes(target)
     for name, *options in recipes(target):
         read_options(name, options)
@@ -135,7 +123,8 @@ def test_deploying_without_a_twin_runs(desk: Path, shell: Shell) -> None:
         if command.words[0] == "launch/deploy.sh":
             program = [str(ROOT / command.words[0]), *words, "--yes"]
             with _cut(desk / words[0]) if "--execute" not in words else nullcontext():
-                done = subprocess.run(program, env={**os.environ, "PATH": _path()})
+                path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+                done = subprocess.run(program, env={**os.environ, "PATH": path})
             assert done.returncode == 0, command
         elif words[0] == "deploy" and not words[1].startswith("runs/twin"):
             assert shell(words) == 0, command
@@ -188,13 +177,10 @@ def _cut(cell_file: Path) -> Iterator[None]:
     cell_file.write_text(text)
 
 
-def _path() -> str:
-    return f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-
-
 def _serve(words: list[str], cell_file: Path) -> "subprocess.Popen[bytes]":
     host = f"127.9.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"  # beside other tests' twins
-    twin = subprocess.Popen([*SHELL, *words, "--host", host])
+    command = [sys.executable, "-m", "touchgoal.launch", *words, "--host", host]
+    twin = subprocess.Popen(command)
     deadline = time.monotonic() + 120
     while not cell_file.exists():
         assert twin.poll() is None and time.monotonic() < deadline
@@ -203,7 +189,7 @@ def _serve(words: list[str], cell_file: Path) -> "subprocess.Popen[bytes]":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", SNIPPET_PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [p for p in PAGES if snippets(p)], ids=lambda page: page.name)
 def test_snippets_run(
     page: Path, desk: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -36,9 +36,6 @@ def make_encoder() -> TouchEncoder:
     return TouchEncoder(config).eval()
 
 
-# ---- preprocessor
-
-
 def test_untouched_is_zero_and_change_is_in_units_of_the_scale() -> None:
     rng = np.random.default_rng(0)
     background = rng.integers(50, 200, (240, 320, 3)).astype(np.uint8)
@@ -60,12 +57,6 @@ def test_pixels_are_averaged_over_their_area() -> None:
     steady = remove_gain(frame[0], background)
     blocks = steady.reshape(120, 2, 160, 2, 3).mean((1, 3)).transpose(2, 0, 1)
     np.testing.assert_allclose(out[0] * MINI.scale + 100, blocks, atol=1e-3)
-
-
-# ---- ViT
-
-
-# ---- InfoNCE
 
 
 def unit(n: int, d: int) -> torch.Tensor:
@@ -94,12 +85,6 @@ def test_multi_positive_is_the_mean_over_right_answers() -> None:
     torch.testing.assert_close(info_nce(a, b, 0.1, positives), -torch.stack(rows).mean())
     both = (info_nce(a, b, 0.1, positives) + info_nce(b, a, 0.1, positives.T)) / 2
     torch.testing.assert_close(symmetric_info_nce(a, b, 0.1, positives), both)
-
-
-# ---- touch encoder
-
-
-# ---- files
 
 
 def test_saved_encoder_is_the_same(tmp_path: Path) -> None:

@@ -143,9 +143,6 @@ def test_commands_leave_faults_out(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "episode 1 of" in printed.err and "frame 20 has the time stamp" in printed.err
 
 
-# ---- sets on a remote file system: read lazily through a mirror, from an S3 server on this machine
-
-
 ADDRESS = "s3://bucket/run"
 
 

@@ -130,9 +130,6 @@ def test_the_benchmarks_run(
         }
 
 
-# ---- published sets
-
-
 CLASSES, PER_CLASS, PER_OBJECT, VIEWS = 2, 4, 8, 4
 
 

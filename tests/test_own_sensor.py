@@ -34,8 +34,6 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_in
 BALL = Surface("ball", 4e-3, 1.0, np.zeros((TILE, TILE), np.float32), 1.0)
 RNG = np.random.default_rng(0)
 UNIT = sample_instance(GELSIGHT_MINI, RNG)
-
-
 CENTRES = [(x, y) for y in (-75, 0, 75) for x in (-110, -40, 40, 110)]  # px from the middle
 
 

@@ -247,8 +247,6 @@ def test_a_width_that_rarely_changes_keeps_its_range() -> None:
     assert normalizer(widths).unique().tolist() == [-1.0, 1.0]
 
 
-# ---- samplers against closed forms and against diffusers; the U-Net against the published one
-
 MEAN, DEVIATION = 0.4, 0.3  # of the Gaussian that the exact flow knows
 
 

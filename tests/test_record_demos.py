@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_cell import write_cell_file
+from in_process import run
 
 from touchgoal.control import features as ft
 from touchgoal.control.interfaces import DriverError
@@ -27,14 +28,11 @@ from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemou
 from touchgoal.control.teleoperation.teleoperator import Teleoperator
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch import record_demos
-from touchgoal.launch.__main__ import main
 from touchgoal.launch.deploy import NOT_DONE
 from touchgoal.runtime.errors import UserError
 
 OBSERVED: dict = {}
 HZ, TICK = 20.0, 0.05
-
-
 # The published table of reports (PySpaceMouse, devices.toml): axis -> report, first byte.
 WIRED = {"x": (1, 1), "y": (1, 3), "z": (1, 5), "rx": (2, 1), "ry": (2, 3), "rz": (2, 5)}
 WIRELESS = {"x": (1, 1), "y": (1, 3), "z": (1, 5), "rx": (1, 7), "ry": (1, 9), "rz": (1, 11)}
@@ -189,10 +187,6 @@ def test_own_demonstrations_train_a_policy_that_deploys(
     assert EpisodeSet(tmp_path / "run" / "episodes").meta(0)["task"] == "put it down"
     with pytest.raises(SystemExit, match="was trained for put it down, not for pick-place"):
         run(*deploying, "--task", "pick-place")
-
-
-def run(*arguments: object) -> None:
-    main([str(a) for a in arguments])
 
 
 def test_a_person_leads_the_arm_by_keys(tmp_path: Path) -> None:

@@ -11,8 +11,6 @@ from touchgoal.launch import make_policy
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.make_policy import Config
 
-SCHEMA = ["command", "measured", "hardware", "printed", "metrics"]
-
 
 @pytest.mark.parametrize("page", records.pages(), ids=lambda page: page.name)
 def test_pages_quote_the_records(page) -> None:
@@ -28,7 +26,7 @@ def test_every_record_is_quoted() -> None:
 @pytest.mark.parametrize("name", sorted(QUOTED))
 def test_a_record_is_complete_and_printed_by_its_benchmark(name: str, capsys) -> None:
     record = records.load_record(name)
-    assert list(record) == SCHEMA
+    assert list(record) == ["command", "measured", "hardware", "printed", "metrics"]
     assert record["command"] == QUOTED[name].command and records.headline(name)
     with pytest.raises(SystemExit):
         main(["benchmark", name, "--recorded"])

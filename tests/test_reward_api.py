@@ -95,9 +95,6 @@ def test_a_mistake_is_one_line(call: Callable[[], Any], message: str) -> None:
     assert "\n" not in str(error.value)
 
 
-# ---- sources
-
-
 def _stripes(shift: int) -> np.ndarray:
     """Thin upright stripes that turn into broad level ones."""
     rows, columns = np.mgrid[:64, :64]
@@ -180,14 +177,13 @@ def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
     assert scaled["metrics"]["image"]["start"] == pytest.approx(1, abs=0.2)
 
 
-def test_python_and_command_agree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_and_command_agree(here: Path) -> None:
     """The command normalises by the encoder's normalizer; so does Python when it is named."""
     pytest.importorskip("transformers")
-    monkeypatch.chdir(tmp_path)
     truth = {TRUTH_START: np.zeros((12, 7), np.float32)}
     meta = {"sensor": "gelsight_mini", "success": True, "object": "cup"}
     episode = replace(EPISODE, frames={**EPISODE.frames, **truth}, meta=meta)
-    EpisodeWriter(tmp_path / "set").append(episode)
+    EpisodeWriter(here / "set").append(episode)
     main(["reward-curves", "set", "--out", "command"])
     report = json.loads(Path("command/episode_000.json").read_text())
     curves = reward_curve(IMAGES, TOUCH, normalizer="encoder")

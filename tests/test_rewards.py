@@ -233,9 +233,6 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
     assert write_report(curves, tmp_path, "ep3", {}, gamma=0.9)["png"].read_bytes() == first
 
 
-# ---- metrics of a curve
-
-
 # Small integers make ties and plateaus common; halves keep every sum exact.
 CURVES = st.lists(st.integers(-6, 6), min_size=3, max_size=24).map(
     lambda values: np.array(values) / 2

@@ -28,6 +28,7 @@ from touchgoal.runtime.errors import UserError
 HZ = 20
 TICKS = int(os.environ.get("TOUCHGOAL_SAFETY_TICKS", "400"))
 LAYERS = {robot.arm.name: ActionFilter(robot, HZ) for robot in (robots.FR3, robots.UR5E)}
+FR3 = LAYERS["FR3"]
 BOTH_ROBOTS = pytest.mark.parametrize("robot", [robots.FR3, robots.UR5E], ids=lambda r: r.arm.name)
 EPS = 1e-9
 
@@ -79,7 +80,7 @@ def pushes(n: int) -> st.SearchStrategy:
 @example([(np.eye(7)[0], 30), (np.full(7, np.nan), 1), (np.eye(7)[0], 5)])
 @example([(-np.eye(7)[5], 60), (np.eye(7)[5], 120)])  # wrist through its whole range
 def test_nothing_leaves_the_limits_of_the_fr3(pushes: list[tuple[np.ndarray, int]]) -> None:
-    run(LAYERS["FR3"], [action for action, ticks in pushes for _ in range(ticks)])
+    run(FR3, [action for action, ticks in pushes for _ in range(ticks)])
 
 
 @settings(max_examples=30, deadline=None)
@@ -134,22 +135,20 @@ def test_fingertips_keep_to_their_speed(robot: RobotLimits) -> None:
 
 
 def test_a_gentle_command_passes_untouched() -> None:
-    layer = LAYERS["FR3"]
-    state = layer.start(layer.limits.arm.home)
+    state = FR3.start(FR3.limits.arm.home)
     action = np.full(7, 0.002)
-    after = layer.filter_action(state, action, reading(state.q))
+    after = FR3.filter_action(state, action, reading(state.q))
     np.testing.assert_allclose(after.q, state.q + action, atol=1e-15)
     assert after.mode is Mode.MOVE and after.active_limits == ()
 
 
 def test_the_joint_margin_is_reached_and_named() -> None:
-    layer = LAYERS["FR3"]
-    state = layer.start(layer.limits.arm.home)
+    state = FR3.start(FR3.limits.arm.home)
     named = set()
     for _ in range(150):
-        state = layer.filter_action(state, np.eye(7)[6], reading(state.q))
+        state = FR3.filter_action(state, np.eye(7)[6], reading(state.q))
         named |= set(state.active_limits)
-    assert state.q[6] == pytest.approx(layer.joints.upper[6], abs=1e-9) and Limit.MARGIN in named
+    assert state.q[6] == pytest.approx(FR3.joints.upper[6], abs=1e-9) and Limit.MARGIN in named
 
 
 FAULTS = [
@@ -166,15 +165,14 @@ FAULTS = [
 
 @pytest.mark.parametrize(("field", "value", "limit"), FAULTS)
 def test_a_fault_brakes_within_limits_and_stays(field: str, value: object, limit: Limit) -> None:
-    layer = LAYERS["FR3"]
-    state = run(layer, [np.full(7, -0.02)] * 8)
+    state = run(FR3, [np.full(7, -0.02)] * 8)
     assert np.abs(state.velocity).max() > 0.3
     bad = replace(reading(state.q), **{field: value})
     for tick in range(12):
         # Later faults and calm readings change nothing.
         now = bad if tick == 0 else reading(state.q, indentation=np.full(2, 99.0 * (tick % 2)))
-        after = layer.filter_action(state, np.full(7, -0.02), now)
-        check(layer, [state, after])
+        after = FR3.filter_action(state, np.full(7, -0.02), now)
+        check(FR3, [state, after])
         state = after
         assert state.mode is Mode.STOP and state.fault and state.fault.limit is limit
     assert (state.velocity == 0).all()
@@ -182,21 +180,19 @@ def test_a_fault_brakes_within_limits_and_stays(field: str, value: object, limit
 
 @pytest.mark.parametrize("age", ["observation_age", "action_age", "state_age"])
 def test_what_is_stale_holds_then_resumes_or_stops(age: str) -> None:
-    layer = LAYERS["FR3"]
-    state = run(layer, [np.full(7, 0.01)] * 3)
-    held = layer.filter_action(state, np.full(7, 0.01), reading(state.q, **{age: 0.12}))
+    state = run(FR3, [np.full(7, 0.01)] * 3)
+    held = FR3.filter_action(state, np.full(7, 0.01), reading(state.q, **{age: 0.12}))
     assert held.mode is Mode.HOLD and held.fault is None
     assert (np.abs(held.velocity) < np.abs(state.velocity)).all()
-    assert layer.filter_action(held, np.full(7, 0.01), reading(held.q)).mode is Mode.MOVE
-    assert layer.filter_action(held, np.full(7, 0.01), reading(held.q, **{age: 1.0})).fault
+    assert FR3.filter_action(held, np.full(7, 0.01), reading(held.q)).mode is Mode.MOVE
+    assert FR3.filter_action(held, np.full(7, 0.01), reading(held.q, **{age: 1.0})).fault
 
 
 def test_actions_that_are_no_numbers_hold_then_stop() -> None:
-    layer = LAYERS["FR3"]
-    state = layer.start(layer.limits.arm.home)
+    state = FR3.start(FR3.limits.arm.home)
     modes = []
     for _ in range(12):
-        state = layer.filter_action(state, np.full(7, np.nan), reading(state.q))
+        state = FR3.filter_action(state, np.full(7, np.nan), reading(state.q))
         modes.append(state.mode)
     assert modes[0] is Mode.HOLD and modes[-1] is Mode.STOP
     assert state.fault and state.fault.limit is Limit.NOT_A_NUMBER
@@ -215,11 +211,10 @@ def test_no_start_outside(robot: RobotLimits) -> None:
 
 @given(st.floats(width=64))
 def test_the_gripper_keeps_to_its_stroke_and_holds_with_the_arm(target: float) -> None:
-    layer = LAYERS["FR3"]
-    start = layer.start(layer.limits.arm.home)
-    moving = layer.filter_action(start, np.zeros(7), reading(start.q))
-    width = layer.filter_width(moving, target, 0.03)
+    start = FR3.start(FR3.limits.arm.home)
+    moving = FR3.filter_action(start, np.zeros(7), reading(start.q))
+    width = FR3.filter_width(moving, target, 0.03)
     assert width == (np.clip(target, 0, 0.08) if np.isfinite(target) else 0.03)
     for age in (0.2, 1.0):  # hold, stop
-        held = layer.filter_action(moving, np.zeros(7), reading(start.q, state_age=age))
-        assert layer.filter_width(held, target, 0.03) == 0.03
+        held = FR3.filter_action(moving, np.zeros(7), reading(start.q, state_age=age))
+        assert FR3.filter_width(held, target, 0.03) == 0.03

@@ -12,8 +12,6 @@ from touchgoal.runtime.seeds import CORRECTIONS, TRAINING, WIRES, SeedRange
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("control", "sim_envs", "episodes", "encoders", "rewards", "policies", "benchmarks")
-
-
 EPISODES = [*CORRECTIONS, *(r for r in vars(seeds).values() if isinstance(r, SeedRange))]
 
 

@@ -54,8 +54,6 @@ def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> N
     assert np.allclose(*backbone.embed_frames(frames, frames[0]))  # the same touch, twice
 
 
-# ---- DINO, and what a teacher shares
-
 HEADS: dict[str, Any] = {"prototypes": 32, "head_width": 16, "head_bottleneck": 8}
 DINO = DinoConfig(vit="tiny", epochs=3, batch_size=12, local_views=3, momentum=0.9, **HEADS)
 
@@ -154,8 +152,6 @@ def test_moments_hold_the_true_past(tmp_path: Path) -> None:
     single = sample_frames(EpisodeSet(tmp_path), SENSOR, 6, 0)
     assert torch.equal(single.touch, moments.touch[:, 0]) and single.stride == 1
 
-
-# ---- I-JEPA and V-JEPA
 
 SMALL: dict[str, Any] = {"epochs": 3, "batch_size": 12, "momentum": 0.9}
 PREDICTOR: dict[str, Any] = {"predictor_width": 24, "predictor_depth": 1, "predictor_heads": 2}

@@ -31,8 +31,6 @@ CROPS = ((ft.FRONT, (0, 32, 0, 32)),)
 SMALL = PoseEstimatorConfig(
     (32, 32), CROPS, 8, look=16, channels=8, keypoints=4, keypoint_features=4, width=16
 )
-
-
 SPOTS = {"red": (255, 0, 0), "blue": (0, 0, 255)}  # the objects; the goal is green
 
 
@@ -133,8 +131,6 @@ def test_placements_say_where_each_object_is() -> None:
 
 SEES = (ft.STATE, ft.TCP_POSE, *ESTIMATED)
 ESTIMATING = replace(TOY, touch_dim=0, touch="", proprioception=SEES, position_noise=0.0)
-
-
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
 JOB = EpisodeSpec(1, options={"object": "wooden_block"})
 

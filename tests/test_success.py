@@ -68,8 +68,6 @@ def test_the_table_says_what_is_accepted_and_what_is_unknown(tmp_path: Path) -> 
     assert "how many failures pass is unknown" in table and "costs 0 whatever happened" in table
 
 
-# ---- made failures
-
 LENGTH, CONTACT = 30, 12
 
 

@@ -159,9 +159,6 @@ def test_encoders_are_judged(strokes: Path, tmp_path: Path, capsys: pytest.Captu
     assert shared_out == [row for row in result["rows"] if row["task"] == "slip"]
 
 
-# ---- grasps, fields; published files
-
-
 def test_the_field_over_the_picture_adds_up_to_the_force() -> None:
     stroke, unit = simulate(RIG, 1), rig_unit(RIG)
     rows, columns = find_sensor(RIG.sensor).image_shape
@@ -190,18 +187,17 @@ def test_metrics_of_labels_and_fields_by_hand() -> None:
     assert field_metrics(0 * half[None], field, np.arange(2))["pressure_explained"] == 0
 
 
-def test_published_files_are_benchmarked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_published_files_are_benchmarked(here: Path) -> None:
     for probe in ("sphere", "sharp", "flat"):
-        write_force_batch(tmp_path / "files" / probe / "batch_1", strokes=5)
+        write_force_batch(here / "files" / probe / "batch_1", strokes=5)
     options = Config(
-        tasks=("force", "slip"), encoders=("end-to-end:tiny",), shares=(1.0,), data=tmp_path / "files",
+        tasks=("force", "slip"), encoders=("end-to-end:tiny",), shares=(1.0,), data=here / "files",
         strokes=15, seeds=1, end_to_end_steps=2, end_to_end_batch_size=4, workers=1,
     )  # fmt: skip
-    before = sorted((tmp_path / "files").rglob("*"))
+    before = sorted((here / "files").rglob("*"))
     result = run(options)
     assert {row["task"] for row in result["rows"]} == {"force", "slip"}
-    assert f"published files in {tmp_path / 'files'}: digit" in result["table"]
-    assert sorted((tmp_path / "files").rglob("*")) == before  # nothing is written there
+    assert f"published files in {here / 'files'}: digit" in result["table"]
+    assert sorted((here / "files").rglob("*")) == before  # nothing is written there
     with pytest.raises(UserError, match="is not for pose: choose --tasks force slip"):
         run(replace(options, tasks=("force", "pose")))

@@ -52,9 +52,6 @@ def untouched(instance: SensorInstance, n: int) -> np.ndarray:
     return np.stack([render_untouched(instance, rng) for _ in range(n)])
 
 
-# Markers.
-
-
 def dotted(
     image: np.ndarray, instance: SensorInstance, moved: np.ndarray | float = 0.0
 ) -> np.ndarray:
@@ -152,8 +149,6 @@ def test_dots_of_another_unit_are_painted_out_whole(seed: int) -> None:
     painted = without_markers(image, dots.positions, dots.largest_radius(DOTS))
     assert contact_strength(painted[None], plain)[0] < 7.0  # counts; refused are 12
 
-
-# Depth and force.
 
 PRESSES = {
     "ball": (Body(GLASS, (0.02,), 0.1), 5.0, None),

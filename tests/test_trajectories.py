@@ -26,8 +26,6 @@ ROBOTS = [
     (robots.FR3, Fr3Kinematics()),
     (robots.UR5E, Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)),
 ]
-
-
 BOTH = pytest.mark.parametrize(("robot", "arm"), ROBOTS, ids=["FR3", "UR5e"])
 DT = 1e-3
 

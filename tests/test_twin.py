@@ -92,9 +92,6 @@ def test_franka_holds_clients_to_its_limits(fr3: RunningTwin) -> None:
     assert worst["excess"] <= 0 and worst["speed"] < 1
 
 
-# ---- UR
-
-
 def drives(address: str) -> dict:
     """Moves, servoes at three rates, and falls silent."""
     from rtde_control import RTDEControlInterface
@@ -144,9 +141,6 @@ def test_ur_moves_servoes_and_watches(ur5e: RunningTwin) -> None:
     np.testing.assert_allclose(result["line"], [0, 0, -0.05], atol=2e-3)
     assert result["kicked"] and not result["silent"]
     assert ur5e.ask("truth")["worst"]["excess"] <= 0
-
-
-# ---- its devices and its control port
 
 
 def test_load_cell_weighs_is_garbled_and_unplugged(fr3: RunningTwin) -> None:

@@ -228,9 +228,6 @@ def test_a_silent_stream_is_said(streamer: Streamer, monkeypatch: pytest.MonkeyP
         VideoCamera(VideoConfig(streamer.url)).read()
 
 
-# ---- USB
-
-
 def plug(root: Path, node: int, product: str, serial: str, index: int = 0) -> None:
     """Nodes as Linux makes them: class/videoN/device links to an interface of a USB device."""
     usb = root / "devices" / f"usb-{serial}"

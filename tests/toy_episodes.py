@@ -51,15 +51,12 @@ def assert_holds(root: Path, seeds: list[int], n: int = 7) -> None:
     episodes = EpisodeSet(root)
     assert [episodes.meta(i)["seed"] for i in range(len(episodes))] == seeds
     for i, seed in enumerate(seeds):
-        assert_same(episodes.read(i), make_episode(seed, n))
-
-
-def assert_same(read: Episode, original: Episode) -> None:
-    assert (read.task, read.meta) == (original.task, original.meta)
-    assert set(read.frames) == set(original.frames)
-    for key in (*NUMERIC, *ft.TACTILE, ft.WRIST):  # so costs are those of the raw frames
-        np.testing.assert_array_equal(read.frames[key], original.frames[key], err_msg=key)
-        assert read.frames[key].dtype == original.frames[key].dtype
+        read, original = episodes.read(i), make_episode(seed, n)
+        assert (read.task, read.meta) == (original.task, original.meta)
+        assert set(read.frames) == set(original.frames)
+        for key in (*NUMERIC, *ft.TACTILE, ft.WRIST):  # so costs are those of the raw frames
+            np.testing.assert_array_equal(read.frames[key], original.frames[key], err_msg=key)
+            assert read.frames[key].dtype == original.frames[key].dtype
 
 
 def flip_byte(path: Path, position: int) -> None:

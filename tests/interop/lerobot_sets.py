@@ -100,9 +100,7 @@ def main() -> None:
     edit(own, out, "own")
     for info in sorted(out.glob("*/meta/info.json")):
         dump(info.parents[1])
-    dump_own = out / "own"
-    shutil.copytree(own, dump_own)
-    dump(dump_own)
+    dump(shutil.copytree(own, out / "own"))
 
 
 if __name__ == "__main__":
