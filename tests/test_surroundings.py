@@ -46,10 +46,9 @@ def test_the_room_dims_and_the_lamp_moves() -> None:
 
 
 def test_objects_grow_lose_friction_and_are_moved_after_a_second() -> None:
-    usual, changed = (
-        PickPlace(PickPlaceConfig(tactile=False, cameras=(), **options))
-        for options in ({}, {"size_factor": 1.2, "friction_factor": 0.5, "nudge": 0.02})
-    )
+    plain = PickPlaceConfig(tactile=False, cameras=())
+    usual = PickPlace(plain)
+    changed = PickPlace(plain, size_factor=1.2, friction_factor=0.5, nudge=0.02)
     for env in (usual, changed):
         env.reset(seed=1)
     body, other = usual.bodies[0], changed.bodies[0]
