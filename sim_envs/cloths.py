@@ -166,6 +166,6 @@ CLOTHS: tuple[Cloth, ...] = (
     Cloth("waffle", (6, 6), 420e-6, _waffle),
     Cloth("mesh", (14, 14), 260e-6, _mesh),
     Cloth("terry", (14, 18), 380e-6, _loops, fuzz=0.35),
-    Cloth("felt", (8, 8), 130e-6, lambda u, v: 0.5 + 0 * (u + v), fuzz=0.8),
+    Cloth("felt", (8, 8), 130e-6, lambda u, v: np.full_like(u + v, 0.5), fuzz=0.8),
     Cloth("quilt", (4, 4), 450e-6, _quilt),
 )

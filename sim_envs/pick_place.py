@@ -101,13 +101,13 @@ class PickPlace(FrankaTactileEnv):
         self.grasp_force = force if chosen.grasp_force is None else chosen.grasp_force
         self.asked = chosen.asked or kind.name
         self.bodies = [sample_body(kind, rng, mass if chosen.mass is None else chosen.mass)]
-        factors = config.size_factor, config.friction_factor
         others = [k for k in CATALOGUE.values() if k.name != kind.name]
         for i in range(config.distractors):
             other = others[rng.integers(len(others))]
             self.bodies.append(
                 sample_body(other, rng, rng.uniform(*config.mass), f"distractor_{i + 1}")
             )
+        factors = config.size_factor, config.friction_factor
         if factors != (1.0, 1.0):
             self.bodies = [body.scaled(*factors) for body in self.bodies]
         taken = [np.array(p) for p in (chosen.start, chosen.goal) if p is not None]

@@ -11,8 +11,8 @@ from touchgoal.runtime.option_types import checked_dataclass
 
 Degrees = Annotated[float, Field(ge=-45, le=45)]
 Metres = Annotated[float, Field(ge=-1, le=1)]
-_MOST_TURN, _MOST_SHIFT, _MOST_LAMP = 7.0, 0.03, 0.4  # of `draw`, degrees and m
-_DIMMEST, _BRIGHTEST = 0.15, 1.3  # of `draw`, shares of the usual light
+_MOST_TURN, _MOST_SHIFT, _MOST_LAMP = 7.0, 0.03, 0.4  # of `draw_surroundings`, degrees and m
+_DIMMEST, _BRIGHTEST = 0.15, 1.3  # of `draw_surroundings`, shares of the usual light
 
 
 @checked_dataclass
@@ -32,7 +32,7 @@ class Surroundings:
 USUAL = Surroundings()
 
 
-def draw(rng: np.random.Generator) -> Surroundings:
+def draw_surroundings(rng: np.random.Generator) -> Surroundings:
     """Draw surroundings within 7 degrees, 3 cm, 0.4 m of the lamp, and 0.15 to 1.3 of the light."""
     yaw, pitch = rng.uniform(-_MOST_TURN, _MOST_TURN, 2)
     x, y, z = rng.uniform(-_MOST_SHIFT, _MOST_SHIFT, 3)
@@ -45,10 +45,10 @@ def draw(rng: np.random.Generator) -> Surroundings:
 class UsualScene:
     """Camera and lights of a compiled scene, from which surroundings differ."""
 
-    eye: Float[np.ndarray, "3"]
-    quat: Float[np.ndarray, "4"]
-    lamp: Float[np.ndarray, "3"]
-    light: tuple[Float[np.ndarray, "..."], ...]
+    eye: Float[np.ndarray, "3"]  # place of the front camera, m
+    quat: Float[np.ndarray, "4"]  # its orientation, wxyz
+    lamp: Float[np.ndarray, "3"]  # place of the lamp that casts shadows, m
+    light: tuple[Float[np.ndarray, "..."], ...]  # see `_light`
 
     @classmethod
     def of(cls, model: Any) -> "UsualScene":
@@ -61,12 +61,10 @@ class UsualScene:
         """Change the model; `surroundings` replace those of earlier calls."""
         import mujoco
 
-        yaw, pitch = np.radians(surroundings.camera_turn)
-        turn, up = (np.array([np.cos(a / 2), 0, 0, 0]) for a in (yaw, pitch))
-        turn[2], up[1] = -np.sin(yaw / 2), np.sin(pitch / 2)  # MuJoCo's cameras: x right, y up
-        both, camera = np.empty(4), model.camera("front")
-        mujoco.mju_mulQuat(both, turn, up)
-        mujoco.mju_mulQuat(camera.quat, self.quat, both)
+        right, up = np.radians(surroundings.camera_turn)
+        turn, camera = np.empty(4), model.camera("front")
+        mujoco.mju_euler2Quat(turn, np.array([-right, up, 0]), "yxz")  # its x is right, y up
+        mujoco.mju_mulQuat(camera.quat, self.quat, turn)
         camera.pos[:] = self.eye + surroundings.camera_shift
         model.light_pos[0] = self.lamp + surroundings.lamp_shift
         for now, usual in zip(_light(model), self.light, strict=True):
@@ -74,5 +72,6 @@ class UsualScene:
 
 
 def _light(model: Any) -> tuple[np.ndarray, ...]:
+    """Return the arrays of the model that hold its brightness."""
     head = model.vis.headlight
     return model.light_diffuse, head.ambient, head.diffuse

@@ -132,7 +132,7 @@ def test_exchanged_cameras_end_a_run_after_its_start_move(exchanged: bool, tmp_p
         return ScriptedActor([], loop.commanded, ft.CONTROL_HZ)
 
     config, safety = read_cell_file(write_cell_file(tmp_path, text)), ActionFilter(FR3, 20)
-    nobody = lambda: "", lambda _: None  # asks, or is told
-    session = Session(config, cell.connection(), safety, lambda *_: 0, True, actor, *nobody)
+    no_operator = {"operator_request": lambda: "", "on_tick": lambda _: None}
+    session = Session(config, cell.connection(), safety, lambda *_: 0, True, actor, **no_operator)
     ending = session.run().ending
     assert ending.stopped == exchanged and ("look exchanged" in ending.reason) == exchanged

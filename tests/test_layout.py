@@ -89,7 +89,7 @@ def test_no_folder_holds_more_than_twelve_files() -> None:
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
-    """As they load: what a function imports when it is called does not count."""
+    """Imports at module level; those inside functions do not count."""
     files = {"touchgoal." + ".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in SOURCES}
     imports = {name: imported_on_load(ast.parse(p.read_text()).body) for name, p in files.items()}
     done: set[str] = set()

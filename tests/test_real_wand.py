@@ -90,7 +90,7 @@ class Person(threading.Thread):
 
     @property
     def lines(self) -> list[str]:
-        """What stands on the terminal."""
+        """Lines printed so far."""
         return [line for line in self.screen.getvalue().split("\n") if line]
 
     def _obey(self, hint: str) -> None:

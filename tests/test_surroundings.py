@@ -1,4 +1,4 @@
-"""Changes of camera, light and objects, judged by where known points appear and what is felt."""
+"""Changes of camera, light and objects: places of known points in the image, sizes, friction."""
 
 from typing import Any
 

@@ -61,8 +61,8 @@ def run(folder: Path, policy: str, seconds: float) -> tuple[Result, FakeCell]:
     def actor(loop: ControlLoop) -> Actor:
         return make_actor(cell, loaded, safety, None, loop.commanded)
 
-    nobody = lambda: "", lambda _: None  # asks, or is told
-    session = Session(cell, fake.connection(), safety, lambda *_: 0, True, actor, *nobody)
+    no_operator = {"operator_request": lambda: "", "on_tick": lambda _: None}
+    session = Session(cell, fake.connection(), safety, lambda *_: 0, True, actor, **no_operator)
     return session.run(), fake
 
 

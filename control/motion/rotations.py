@@ -11,8 +11,7 @@ Matrix3 = Float[np.ndarray, "3 3"]
 def rotation_vector(R: Matrix3) -> Vector3:
     """Return axis times angle (rad) of a rotation matrix.
 
-    cv2.Rodrigues returns 0 for turns below 1e-5 rad, which at 1 kHz are 0.01 rad/s; scipy's takes nine
-    times as long.
+    cv2.Rodrigues returns 0 for turns below 1e-5 rad, which at 1 kHz are 0.01 rad/s; scipy's is slower.
     """
     cosine = np.clip((np.trace(R) - 1) / 2, -1.0, 1.0)
     skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2

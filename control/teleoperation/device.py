@@ -1,5 +1,6 @@
 """Base of teleoperation devices: the motion of the hand that a person asks for."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,17 +23,17 @@ class HandMotion:
     gripper: GripperRequest = ""  # empty: go on as before
 
 
-class TeleoperationDevice:
+class TeleoperationDevice(ABC):
     """A device that is read once a control tick."""
 
     verdict: Verdict = ""  #: how the device itself ends the episode; empty: a person does, by key
 
-    def press(self, keys: str) -> None:
+    def press(self, keys: str) -> None:  # noqa: B027  # most devices are not typed at
         """Take what was typed at the terminal, if the device is the keyboard."""
 
+    @abstractmethod
     def read(self, observation: Observation) -> HandMotion:
         """Return the present request without waiting; DriverError if the device has gone."""
-        raise NotImplementedError
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027  # some hold nothing to release
         """Release the device, if there is one to release."""

@@ -15,7 +15,7 @@ from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.surroundings import USUAL, UsualScene, draw
+from touchgoal.sim_envs.surroundings import USUAL, UsualScene, draw_surroundings
 
 MOST = 4  # objects on the table
 _ALONE = 0.4  # share of the placements with one object
@@ -88,7 +88,8 @@ def _render_scene(
     rng = env.np_random.spawn(1)[0]
     scene, rows = UsualScene.of(env.model), []
     for _ in range(placements_each):
-        scene.change(env.model, draw(rng) if rng.random() > usual else USUAL)
+        changed = rng.random() > usual
+        scene.change(env.model, draw_surroundings(rng) if changed else USUAL)
         rows.append(_render_placement(env, rng, painted))
     env.close()
     return rows

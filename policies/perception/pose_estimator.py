@@ -1,7 +1,7 @@
 """Pose estimator: a network from an episode's first camera images to object and goal poses.
 
 It looks twice: a coarse map scores where the named object and the goal are; a crop around each, at
-full resolution, gives their poses.
+full resolution, gives their poses. Keypoints of the whole image show how the camera stands.
 """
 
 from dataclasses import replace

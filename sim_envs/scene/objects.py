@@ -73,7 +73,7 @@ class Body:
     hull: Float[np.ndarray, "n 3"] | None = field(default=None, compare=False)
 
     def scaled(self, size: float, friction: float) -> "Body":
-        """Return it with size and friction multiplied."""
+        """Return the body with its size and friction multiplied."""
         material = replace(self.kind.material, friction=friction * self.kind.material.friction)
         return replace(
             self,

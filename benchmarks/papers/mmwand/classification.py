@@ -26,6 +26,7 @@ from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_ov
 from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_classification
 from touchgoal.encoders.alignment.splits import split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet
+from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 
@@ -91,6 +92,7 @@ def run(config: Config) -> dict[str, Any]:
 def _fine_tuned(config: Config, data: EmbeddedSet) -> list[dict[str, Any]]:
     if not config.fine_tuned:
         return []
+    check_device(config.device)
     pictures, rows = read_pictures(WandSet.open(config.data), config.picture_rows), []
     for split in config.splits:
         fold = split_touches(split, data.label, data.visit, data.describes, config.seed)

@@ -135,8 +135,8 @@ def _backbone(
 ) -> tuple[nn.Module, Callable[[nn.Module, Tensor], Tensor], int]:
     """Return a network, the function that gives its features, and their number."""
     if network == "efficientnet":
-        network_ = load_efficientnet_lite0(fuse=False)
-        return network_, lambda m, x: m.features(x), FEATURES  # pyright: ignore[reportCallIssue]
+        unfused = load_efficientnet_lite0(fuse=False)
+        return unfused, lambda m, x: m.features(x), FEATURES  # pyright: ignore[reportCallIssue]
     try:
         from transformers import ResNetConfig, ResNetModel, ViTConfig, ViTModel
     except ImportError as error:
