@@ -9,7 +9,7 @@ CODE := runtime control sim_envs episodes encoders rewards policies benchmarks l
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy maze-wrench-policy pick-place-policy pose-estimator clean
+.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy maze-wrench-policy pick-place-policy pose-estimator fragile-carry clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -33,12 +33,12 @@ interop: $(READY)
 
 # Sets both ways between touchgoal and lerobot, and our policy in lerobot-eval; lerobot runs in an environment
 # of its own, under its own pins.
-PYTHON312 ?= python3.12
+PYTHON312 ?= $(lastword python3.12 $(wildcard ~/.pyenv/versions/3.12.*/bin/python3.12))
 interop-lerobot: $(READY)
 	$(PYTHON312) -m venv .venv-lerobot
 	.venv-lerobot/bin/pip install -q "lerobot[dataset,diffusion]==0.6.1"
 	$(BIN)/python tests/interop/lerobot_run.py .venv-lerobot/bin/python
-	.venv-lerobot/bin/pip install -q -e ".[towers]"
+	.venv-lerobot/bin/pip install -q -e ".[towers,franka]"
 	$(BIN)/python tests/interop/lerobot_plugins.py .venv-lerobot/bin/python
 
 # Format, lint and types.
@@ -106,6 +106,23 @@ weights-markers: $(READY)
 pose-estimator: $(READY)
 	$(BIN)/touchgoal train-pose-estimator --out runs/pose
 	cp runs/pose/estimator/* policies/weights/pick_place/estimator/
+
+# The task where touch decides: one policy for each choice of inputs, on the same demonstrations.
+FRAGILE := collect-demos --task fragile-carry --env.cameras front wrist
+CARRY := train-policy --data runs/fragile/train/episodes --validation runs/fragile/val/episodes --trials 0 \
+	--representation base_twist --position-noise 0 --arm-state commanded --observation-horizon 4 --head regression \
+	--train.lr 1e-3 --train.epochs 20
+TOUCH := --encoder gelsight_mini_markers_mae --touch-input embedding
+fragile-carry: $(READY)
+	$(BIN)/touchgoal $(FRAGILE) --episodes 20 --seed 100000 --out runs/fragile/val
+	$(BIN)/touchgoal $(FRAGILE) --episodes 151 --out runs/fragile/train
+	$(BIN)/touchgoal $(CARRY) $(TOUCH) --out runs/fragile/touch
+	$(BIN)/touchgoal $(CARRY) --cameras front wrist --out runs/fragile/sight
+	$(BIN)/touchgoal $(CARRY) --out runs/fragile/state
+	$(BIN)/touchgoal $(CARRY) --hand-force --out runs/fragile/force
+	$(BIN)/touchgoal $(CARRY) $(TOUCH) --cameras front wrist --out runs/fragile/both
+	$(BIN)/touchgoal benchmark fragile-carry \
+		--policies $(foreach inputs,touch both sight force state,runs/fragile/$(inputs)/policy)
 
 pick-place-policy: $(READY)
 	$(BIN)/touchgoal make-policy --out runs/pick_place

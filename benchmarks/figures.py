@@ -27,7 +27,7 @@ def fewest_and_most(metrics: Metrics) -> str:
     """Success of the worst and the best row."""
     done = [_rate(row["trials"]) for row in metrics["rows"]]
     worst, best = (f(done, key=lambda rate: rate.successes) for f in (min, max))
-    return f"{worst} (worst row) to {best} (best row)"
+    return f"worst {worst}, best {best}"
 
 
 def maze(metrics: Metrics, **names: str) -> str:
@@ -39,6 +39,12 @@ def maze(metrics: Metrics, **names: str) -> str:
     return "; ".join(found)
 
 
+def inputs(metrics: Metrics) -> str:
+    """Success by what the policy reads."""
+    rows = metrics["closed_loop"].items()
+    return "; ".join(f"{name} {_rate(trials)}" for name, trials in rows if "state" in name)
+
+
 def reward_kinds(metrics: Metrics, scene: str) -> str:
     """Mean AUC of the last cost over the kinds of failure: fused, and the plain distance."""
 
@@ -47,6 +53,21 @@ def reward_kinds(metrics: Metrics, scene: str) -> str:
         return f"{found['value']:.2f} [{found['low']:.2f}, {found['high']:.2f}]"
 
     return f"{figure('fused')} fused, {figure('image+tactile')} plain distance"
+
+
+def imitated(metrics: Metrics) -> str:
+    """Success of policies whose demonstrations were weighted by each reward, all seeds together."""
+    found = {
+        name: SuccessRate(int(sum(f["successes"] for f in seeds)), metrics["trials"] * len(seeds))
+        for name, seeds in metrics["imitation"].items()
+    }
+    return "; ".join(f"{name} {rate}" for name, rate in found.items())
+
+
+def grasps_found(metrics: Metrics) -> str:
+    """Objects lifted by the grasp that each search ended with."""
+    lifted = metrics["lifted"].items()
+    return "; ".join(f"{name} {SuccessRate(sum(done), len(done))}" for name, done in lifted)
 
 
 def median_rate(metrics: Metrics, start: str, unit: str) -> str:

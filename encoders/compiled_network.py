@@ -7,6 +7,7 @@ import warnings
 from functools import cache
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -33,10 +34,14 @@ class CompiledNetwork:
         return CompiledNetwork, (self._network,)
 
     def __call__(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
-        """Return the network's outputs, on the CPU."""
-        height, width = images.shape[2:]
-        found = self._request(height, width).infer([images.contiguous().numpy()])
-        return tuple(torch.from_numpy(found[i]) for i in range(len(found)))
+        """Return the network's outputs, on the CPU.
+
+        Image by image, which stays in the processor's cache: 32 at once take 1.4 times as long.
+        """
+        request = self._request(*images.shape[2:])
+        found = [request.infer([one.contiguous().numpy()]) for one in images.split(1)]
+        outputs = range(len(found[0]))
+        return tuple(torch.from_numpy(np.concatenate([f[i] for f in found])) for i in outputs)
 
     def _request(self, height: int, width: int) -> Any:
         """Return this thread's own request: a request runs once at a time."""

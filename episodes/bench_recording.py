@@ -27,11 +27,11 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.cloths import CLOTHS, press_cloth
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.grasp_rig import attempt_grasp
 from touchgoal.sim_envs.indenter_rig import FPS, simulate
 from touchgoal.sim_envs.object_slides import HELD, Slide, simulate_catalogue_slide, simulate_slide
+from touchgoal.sim_envs.tactile.rig.cloths import CLOTHS, press_cloth
 
 Recording = Literal["strokes", "slides", "catalogue slides", "grasps", "cloths"]
 """Content of a set: indenter strokes; slides of held shapes, or of pick-and-place's objects, each on another

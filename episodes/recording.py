@@ -23,7 +23,7 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
 from touchgoal.runtime.progress import progress_bar, track
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import BeadMazeConfig, Outcome, TaskConfig
+from touchgoal.sim_envs.config import Outcome, TaskConfig
 from touchgoal.sim_envs.scene.filming import SceneRecorder
 from touchgoal.sim_envs.scene.objects import CATALOGUE, of_same_shape
 from touchgoal.sim_envs.tasks import make_env, make_expert
@@ -47,6 +47,8 @@ class EpisodeSpec:
     options: dict[str, Any] = field(default_factory=dict)
 
 
+OnTick = Callable[[dict[str, np.ndarray], UInt8[np.ndarray, "h w 3"]], None]
+"""Takes each tick that `run` yields, and the film's newest picture."""
 CORRECTED = "corrected"
 """Outcome of an episode in which a policy acted while an expert's actions were recorded."""
 Roles = Callable[[Any, EpisodeSpec], tuple[Actor, Actor]]
@@ -71,11 +73,7 @@ def episode_specs(
 
     There are `episodes` of each outcome; seeds count up from the first one.
     """
-    if isinstance(env, BeadMazeConfig):
-        options = [{"wire": wire.name} for wire in env.chosen_wires()]
-    else:
-        options = [{"object": name} for name in env.objects or CATALOGUE]
-    n = len(outcomes)
+    options, n = env.reset_options(), len(outcomes)
     return [
         episode_spec(first_seed + i, outcomes[i % n], options[i // n % len(options)])
         for i in range(n * episodes)
@@ -151,6 +149,7 @@ def record_with_film(
     spec: EpisodeSpec,
     policy: Callable[[Any], Actor] | None = None,
     meshes: Literal["fast", "full"] = "full",
+    on_tick: OnTick | None = None,
 ) -> tuple[Episode, UInt8[np.ndarray, "n h w 3"]]:
     """Record and film an episode, tick by tick; the images are for `episodes.film.write_film`.
 
@@ -163,7 +162,9 @@ def record_with_film(
     at_most = round(env.config.max_seconds * env.config.control_hz)
     for tick in track(run(env, actor, observation, info), "filming", "frame", total=at_most):
         ticks.append(tick)
-        film.capture()
+        picture = film.capture()
+        if on_tick is not None:
+            on_tick(tick, picture)
     film.close()
     return to_episode(env, ticks, spec), film.pictures
 
@@ -183,6 +184,7 @@ def to_episode(
             "seed": spec.seed,
             "outcome": _outcome(spec.outcome, frames, success),
             "success": success,
+            "failures": env.failures(),
         },
     )
 
@@ -252,10 +254,8 @@ def _failure(description: Description) -> str:
     meta, stats = description.meta, description.stats
     if meta["success"] or meta["outcome"] not in ("failure", CORRECTED):
         return ""
-    names = ft.FEATURES[ft.TRUTH_FAILURE].names
-    for name, value in zip(names, stats.get(ft.TRUTH_FAILURE, {}).get("max", []), strict=False):
-        if value:
-            return name.replace("_", " ")
+    if (failures := meta["failures"]) and isinstance(failures, list):
+        return failures[0].replace("_", " ")
     if ft.TRUTH_CONTACT in stats and not any(stats[ft.TRUTH_CONTACT]["max"]):
         return "time is up before any contact"
     return "time is up"

@@ -15,6 +15,10 @@ from touchgoal.runtime.run_folder import open_run
 
 BENCHMARKS = {
     "bead-maze": ("papers.bead_maze", "bead maze: success on unseen wires (TacBench T5)"),
+    "fragile-carry": (
+        "papers.fragile_carry",
+        "a rod that slips or breaks: success by what the policy reads",
+    ),
     "retrieval": (
         "papers.mmwand.retrieval",
         "touch, pictures and sentences find each other (MMWand IV)",
@@ -31,6 +35,11 @@ BENCHMARKS = {
         "papers.reward_quality.benchmark",
         "dense costs against outcomes (MMWand V-E)",
     ),
+    "reward-use": (
+        "papers.reward_use",
+        "demonstrations weighted, checkpoints ranked by the reward",
+    ),
+    "grasp-search": ("papers.grasp_search", "grasps found by trial on the cost"),
     "tacbench": ("papers.tacbench.benchmark", "force, slip, pose, grasp, cloth from frozen touch"),
     "real-touch": ("real_touch.videos", "encoders on labelled videos of real touch"),
     "real-force": ("real_touch.forces", "force and contact on real grasps with a load cell"),

@@ -5,12 +5,17 @@ pictures. Leave the gel untouched for the first second, then press any object, p
 (--ball-mm), or lay a weight on the gel (--weight-g).
 """
 
+from collections.abc import Callable
+from itertools import count
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from touchgoal.runtime.option_types import Corners, Positive, checked_dataclass
+
+if TYPE_CHECKING:
+    from touchgoal.runtime.viewer.stream import RerunStream
 
 
 @checked_dataclass
@@ -32,6 +37,9 @@ class Config:
     """Exposure to lock, in the camera's units; default: as it is set."""
     seconds: Positive = 20.0
     """For how long a live sensor is watched, s; Ctrl-C ends earlier."""
+    rerun: str | None = None
+    """Also show each frame, its contact strength and contact in the rerun viewer (extra viz): live, or
+    an .rrd file to write."""
     out: Path | None = None
     """Folder of the run."""
 
@@ -45,6 +53,7 @@ def main(config: Config) -> None:
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.picture_file import write_picture
     from touchgoal.runtime.run_folder import open_run
+    from touchgoal.runtime.viewer.stream import open_rerun
 
     sensor, seconds = find_sensor(config.sensor), config.seconds
     ball = config.ball_mm and config.ball_mm * 1e-3
@@ -52,9 +61,27 @@ def main(config: Config) -> None:
     if not is_recorded(config.source):
         print(f"leave the gel untouched for a second, then press; {seconds:g} s", flush=True)
     frames = open_frames(config.source, sensor, config.corners, config.exposure, seconds=seconds)
-    check = check_sensor(frames, sensor, ball)
+    if config.rerun is None:
+        check = check_sensor(frames, sensor, ball)
+    else:
+        with open_rerun(config.rerun) as stream:
+            check = check_sensor(frames, sensor, ball, _shown_in(stream))
     figures = check_report.figures(check, config.ball_mm, config.weight_g)
     print("\n".join(check_report.lines(check, figures)))
     write_json(out / "metrics.json", figures)
     write_picture(out / "check.png", check_report.picture(check))
     print(f"presses, their change and depth: {out / 'check.png'}")
+
+
+def _shown_in(stream: "RerunStream") -> Callable[[Any, float, bool], None]:
+    """Return what logs a frame; frames have no time, they are counted from 1."""
+    frames = count(1)
+
+    def show(frame: Any, strength: float, touching: bool) -> None:
+        scalars = {
+            "sensor/strength (counts)/strength": strength,
+            "sensor/contact/contact": touching,
+        }
+        stream.log(next(frames), None, {"sensor/fingertip": frame}, scalars)
+
+    return show

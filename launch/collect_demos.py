@@ -8,6 +8,7 @@ from pathlib import Path
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import (
     BeadMazeConfig,
+    FragileCarryConfig,
     Outcome,
     PickPlaceConfig,
     TaskConfig,
@@ -17,6 +18,7 @@ from touchgoal.sim_envs.config import (
 ENVS: dict[TaskName, TaskConfig] = {
     "pick-place": PickPlaceConfig(),
     "bead-maze": BeadMazeConfig(disturbance=0.004),  # demonstrates recovery
+    "fragile-carry": FragileCarryConfig(disturbance=0.003),
 }
 """Default options of each task's environment."""
 NO_SUCCESS = 3  # exit status
@@ -47,7 +49,7 @@ class Config:
     """Number of simulating processes."""
     ray: str | None = None
     """Address of a Ray cluster whose cores work in place of --workers; auto: one started on this machine."""
-    env: PickPlaceConfig | BeadMazeConfig = ENVS["pick-place"]
+    env: TaskConfig = ENVS["pick-place"]
     """Options of the task; its objects or wires are taken in turn."""
 
 

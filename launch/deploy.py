@@ -17,10 +17,14 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from touchgoal.control.cell.config import CellConfig
     from touchgoal.control.cell.connection import CellConnection
     from touchgoal.control.deployment.actors import DeployedPolicy
+    from touchgoal.control.deployment.control_loop import TickStatus
     from touchgoal.control.deployment.session import Result
+    from touchgoal.runtime.viewer.stream import BackgroundStream
 
 NOT_DONE, STOPPED = 3, 4  # exit status
 
@@ -48,6 +52,8 @@ class Config:
     """Random seed of the scene, in place of the cell file's (simulated arm or twin only)."""
     task: str = ""
     """Name of a task of your own, in place of the cell file's."""
+    rerun: str | None = None
+    """Also show every tick in the rerun viewer (extra viz): live, or an .rrd file to write."""
     out: Path | None = None
     """Folder of the run; the episode goes to its `episodes/`, after those already there."""
 
@@ -58,6 +64,7 @@ def main(config: Config) -> None:
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.launch.support.cell_run import connect
     from touchgoal.runtime.run_folder import open_run
+    from touchgoal.runtime.viewer.stream import BackgroundStream
 
     file = find_cell_file(config.cell)
     cell = read_cell_file(file, config.policy, config.sim, config.seed, config.task, config.target)
@@ -70,13 +77,18 @@ def main(config: Config) -> None:
     check_client(cell)
     out = open_run(config.out, "deploy", config, adds=True)
     print(_summary(cell, config), flush=True)
-    connection = connect(cell)
+    stream = BackgroundStream(config.rerun) if config.rerun is not None else None
     try:
-        result = _deploy(config, cell, policy, cost, connection, out / "episodes")
+        connection = connect(cell)
+        try:
+            result = _deploy(config, cell, policy, cost, connection, out / "episodes", stream)
+        finally:
+            connection.close()
+            if cost is not None:
+                cost.close()
     finally:
-        connection.close()
-        if cost is not None:
-            cost.close()
+        if stream is not None and (problem := stream.close()):
+            print(problem, file=sys.stderr)
     _report(result, out)
 
 
@@ -111,6 +123,7 @@ def _deploy(
     cost: Any,
     connection: "CellConnection",
     episodes: Path,
+    stream: "BackgroundStream | None",
 ) -> "Result":
     from functools import partial
 
@@ -125,10 +138,16 @@ def _deploy(
     def request() -> Request:
         return terminal.operator_request() or ("failed" if cost and cost.failed else "")
 
+    def on_tick(status: "TickStatus") -> None:
+        terminal.show_tick(status)
+        if log is not None:
+            log(status)
+
     safety = check_cell(cell, connection, episodes)
     if config.execute and not config.yes:
         confirm(cell)
     terminal = Terminal()
+    log = _shown_in(stream, safety.dt) if stream is not None else None
     session = Session(
         cell=cell,
         connection=connection,
@@ -137,13 +156,39 @@ def _deploy(
         execute=config.execute,
         make_actor=lambda loop: make_actor(cell, policy, safety, connection.truth, loop.commanded),
         operator_request=request,
-        on_tick=terminal.show_tick,
+        on_tick=on_tick,
         cost=cost.latest_cost if cost else None,
         camera_size=policy.camera_size if policy else ft.CAMERA_SHAPE[:2],
     )
     with terminal.watching():
         print(f"{'MOVING' if config.execute else 'dry run'}: {HELP}", flush=True)
         return session.run()
+
+
+def _shown_in(stream: "BackgroundStream", dt: float) -> "Callable[[TickStatus], None]":
+    """Return what logs a tick of `dt` (s), its command as an episode's action."""
+    from itertools import count
+
+    import numpy as np
+
+    from touchgoal.control import features as ft
+    from touchgoal.control.tick_parts import parts_of
+
+    frames = count()
+
+    def show(status: "TickStatus") -> None:
+        tick = {**status.reading.observation}
+        tick[ft.ACTION] = np.append(status.state.velocity * dt, status.width)
+        if status.cost is not None:
+            tick[ft.COST] = np.array([status.cost])
+        images, scalars = parts_of(tick, "arm")
+        for key, depth in zip(ft.TACTILE, status.reading.indentation, strict=True):
+            if key in tick:
+                curve = key.removeprefix(ft.IMAGE_PREFIX)
+                scalars[f"arm/indentation (mm)/{curve}"] = 1e3 * depth
+        stream.log(next(frames), status.seconds, images, scalars)
+
+    return show
 
 
 def _report(result: "Result", out: Path) -> None:

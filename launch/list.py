@@ -16,6 +16,7 @@ Kind = Literal["objects", "sensors", "tasks", "policies", "encoders", "benchmark
 TASKS = {
     "pick-place": "pick an object up and place it on a disc",
     "bead-maze": "lead a bead along a bent wire by touch",
+    "fragile-carry": "carry a rod that slips when held too loosely and breaks when held too hard",
 }
 OWN_POLICIES = {
     "FOLDER": "a policy that train-policy made: its folder policy/",

@@ -12,9 +12,9 @@ import time
 from pathlib import Path
 from typing import Annotated
 
+from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import RARE, Count, CountOrNone, checked_dataclass
-from touchgoal.sim_envs.config import TaskName
 
 RECIPE = "recipe.json"
 
@@ -47,7 +47,7 @@ _VALIDATION = shlex.split(
 class Config:
     """Options of make-policy."""
 
-    task: TaskName = "pick-place"
+    task: SimulatedTask = "pick-place"
     """Task of the policy."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/policy`."""

@@ -10,6 +10,7 @@ measured. The same command with the same --out continues an interrupted run.
 """
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -56,11 +57,14 @@ class Config:
     audit: CountOrNone = 0
     """Number of trajectories, from the first, whose touch is replaced to see if it mattered. They are
     embedded once more and held in memory; goals must come from other trajectories."""
-    rerun: Path | None = None
-    """Also write cameras, fingertips and curves of the trajectories with a plot to this .rrd file, for
-    the rerun viewer (extra viz)."""
+    rerun: str | None = None
+    """Also show cameras, fingertips and curves of the trajectories with a plot in the rerun viewer (extra
+    viz): live, or an .rrd file to write."""
     workers: Count = 2
     """Number of threads that decode ahead of the encoders."""
+    ray: str | None = None
+    """Address of a Ray cluster whose cores embed trajectories side by side, in place of this process;
+    auto: the one started on this machine."""
     device: str = "cpu"
     """Torch device of the encoders: cpu, cuda or cuda:1."""
     out: Path | None = None
@@ -72,21 +76,25 @@ def main(config: Config) -> None:
     from touchgoal.episodes.keys import use_keys
     from touchgoal.rewards.audit import audit_trajectories
     from touchgoal.rewards.default_goal import goals_of
+    from touchgoal.rewards.embed_trajectories import EncoderOptions, embed_here, embed_on_ray
     from touchgoal.rewards.goals import Bank, OwnFrame, assign_goals, parse_goal
     from touchgoal.rewards.measure import Measurement, write_skipped
     from touchgoal.rewards.report.frame_table import FRAMES
     from touchgoal.rewards.report.page import PAGE
     from touchgoal.rewards.report.report import report_all
-    from touchgoal.rewards.report.rerun_recording import load_rerun, write_recording
+    from touchgoal.rewards.report.rerun_recording import write_recording
     from touchgoal.rewards.reward_model import RewardModel, load_reward_model
     from touchgoal.rewards.sources.open_source import open_source
     from touchgoal.rewards.sources.trajectory import Trajectory
     from touchgoal.rewards.success import load_success_threshold
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.run_folder import open_run
+    from touchgoal.runtime.viewer.stream import LIVE, load_rerun
 
     if config.rerun is not None:
-        load_rerun()
+        load_rerun(config.rerun)
+    if config.ray is not None and config.device != "cpu":
+        raise UserError("--ray works on the cores of a cluster: leave out --device")
     use_keys(config.keys)
     with_touch = config.towers is None or config.encoder is not None
     source = open_source(config.source, config.camera, config.index, with_touch, config.fps)
@@ -114,11 +122,16 @@ def main(config: Config) -> None:
         raise UserError("--audit needs goals from other trajectories: --goal bank:SET, for example")
     out = open_run(config.out, "reward-curves", config)
     measurement = Measurement(source.trajectories, model_of, out, config.gamma, config.plots)
+    embed = partial(embed_here, embedder=model.embedder, workers=config.workers)
+    if config.ray is not None:
+        parts = model.embedder.with_parts
+        options = EncoderOptions(source.inputs, config.encoder, config.towers, parts)
+        embed = partial(embed_on_ray, options=options, address=config.ray)
     total = len(source.trajectories) + len(source.skipped)
     if done := len(measurement.records):
         print(f"{done:,} of {total:,} trajectories are measured in {out}")
     try:
-        speed = measurement.run(config.workers)
+        speed = measurement.run(embed)
     except KeyboardInterrupt as interruption:
         kept = f"{len(measurement.records)} of {total} trajectories are measured"
         interruption.add_note(f"{kept}; the same command with --out {out} continues")
@@ -133,6 +146,7 @@ def main(config: Config) -> None:
     report_all(measurement.records, out, model.provenance(), threshold, audit)
     if config.rerun is not None:
         write_recording(config.rerun, source.trajectories[: config.plots], measurement.records)
-        print(f"look at it: rerun {config.rerun}")
+        if config.rerun != LIVE:
+            print(f"look at it: rerun {config.rerun}")
     print(f"{summary}; {speed}")
     print(f"next: look at {out / PAGE}; train on {out / FRAMES}")

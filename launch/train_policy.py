@@ -20,18 +20,21 @@ from touchgoal.runtime.option_types import (
     CountOrNone,
     Fraction,
     NotNegative,
+    Positive,
     checked_dataclass,
 )
 from touchgoal.sim_envs.config import ENVS as _ENVS
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
+from touchgoal.sim_envs.config import TaskConfig, TaskName
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.policies.network import PolicyConfig
     from touchgoal.policies.perception.frozen_images import ImageInputConfig
     from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 
-ENVS = dict(reversed(_ENVS.items()))
+ENVS: dict[TaskName, TaskConfig] = {"bead-maze": _ENVS["bead-maze"], **_ENVS}
 """Default options of each task's environment; `--help` shows the first one's."""
 # Sparsh (C.7). It leaves open how many ticks of a plan are done (here all 8), at what rate, and for
 # how long to train (here the 600 epochs of diffusion_policy's real-robot tasks).
@@ -63,11 +66,16 @@ class Config(TrainingOptions):
     diffusion_policy): U-Net of 87 M, 100 DDPM steps, joint changes, 600 epochs. Days on a CPU."""
     include_unknown: Annotated[bool, RARE] = False
     """Also train on episodes that do not say whether they succeeded."""
+    progress: Path | None = None
+    """touchgoal_progress.parquet that reward-curves wrote for --data: failed episodes are taken, too, and
+    what makes progress towards the goal is imitated (RA-BC)."""
+    progress_seconds: Annotated[Positive, RARE] = 1.0
+    """Time in which the progress is made, s."""
     trim_pauses: bool = False
     """Leave out the frames of each episode before arm or gripper first move."""
     task: str | None = None
-    """Task of the episodes; default: the one they name. Snapshots are tried in pick-place or bead-maze; of
-    any other task, which is known by its recordings alone, the last one is taken."""
+    """Task of the episodes; default: the one they name. Snapshots are tried in a simulated task; of any
+    other, which is known by its recordings alone, the last one is taken."""
     encoder: Path | None = None
     """Frozen touch encoder: a folder (train-encoder), or the name of a shipped one; default: none."""
     end_to_end: bool = False
@@ -75,6 +83,8 @@ class Config(TrainingOptions):
     cameras: tuple[str, ...] = ()
     """Cameras that the policy reads, such as front wrist: keypoints of a frozen image encoder's
     feature maps, read at every plan; default: none."""
+    hand_force: bool = False
+    """The policy also reads the force and torque on the hand; not with body_twist."""
     estimator: Path | None = None
     """Folder of a pose estimator (train-pose-estimator). The policy is trained on the simulator's
     contacts and object poses, without images; when it acts, contact comes from touch and the poses
@@ -117,7 +127,7 @@ class Config(TrainingOptions):
     """Noise schedule and denoising of a diffusion policy."""
     trials: CountOrNone = 24
     """Number of validation episodes in which every snapshot is tried; 0 takes the last snapshot."""
-    env: PickPlaceConfig | BeadMazeConfig = ENVS["bead-maze"]
+    env: TaskConfig = ENVS["bead-maze"]
     """Options of the task in which snapshots are tried; name it with --task."""
     workers: Count = os.cpu_count() or 1
     """Processes that simulate."""
@@ -151,7 +161,11 @@ def main(config: Config) -> None:
         load_pose_estimator(config.estimator)
         parts[ESTIMATOR] = config.estimator
     sets = open_sets(config.data, config.validation)
-    found = [training_data.choose_episodes(s, config.include_unknown) for s in sets]
+    unknown, failed = config.include_unknown, config.progress is not None
+    found = [
+        training_data.choose_episodes(sets[0], unknown, failed),
+        training_data.choose_episodes(sets[1], unknown),
+    ]
     rows = [f.rows for f in found]
     rows[0] = rows[0][: max(1, round(config.share * len(rows[0])))]
     chosen = list(zip(sets, rows, strict=True))
@@ -176,7 +190,9 @@ def main(config: Config) -> None:
         load_recordings(s, r, policy, touch, workers, skip=skip)
         for (s, r), skip in zip(chosen, skipped, strict=True)
     )
-    windows, validation = (SequenceDataset(own, policy) for own in recordings)
+    first, other = recordings
+    weights = _weights(config, sets[0], rows[0], skipped[0]) if config.progress else None
+    windows, validation = SequenceDataset(first, policy, weights), SequenceDataset(other, policy)
     print(f"{len(windows)} windows of {len(rows[0])} episodes; {len(validation)} for validation")
     provenance = recipe(*sets) | {"episodes": len(rows[0])}
     train(policy, windows, validation, config.train, out, config, provenance)
@@ -205,6 +221,8 @@ def _policy_config(
     from touchgoal.policies.perception.state_estimation import ESTIMATED
 
     columns = ft.STATE, ft.TCP_POSE, *[ft.COMMAND] * (config.arm_state == "commanded")
+    if config.hand_force or config.estimator:
+        columns += (ft.WRENCH,)
     head = MLPConfig()
     if config.head != "regression":
         denoiser = MLPConfig() if config.head == "mlp" else PRESETS[config.head]
@@ -218,7 +236,7 @@ def _policy_config(
         position_noise=config.position_noise,
         end_to_end=EndToEndConfig() if config.end_to_end else None,
         images=_image_input(config, episodes),
-        proprioception=(*columns, ft.WRENCH, *ESTIMATED) if config.estimator else columns,
+        proprioception=(*columns, *ESTIMATED) if config.estimator else columns,
         representation=config.representation,
         observation_horizon=config.observation_horizon,
         execution_horizon=config.execution_horizon,
@@ -226,6 +244,19 @@ def _policy_config(
         control_hz=episodes.fps,
         head=head,
     )
+
+
+def _weights(
+    config: Config, episodes: "EpisodeSet", rows: list[int], skip: list[int] | None
+) -> "np.ndarray":
+    from touchgoal.policies.training.progress_weights import progress_weights, read_progress
+
+    assert config.progress is not None
+    progress = read_progress(config.progress, rows, [episodes.lengths[i] for i in rows])
+    progress = [p[n:] for p, n in zip(progress, skip or [0] * len(rows), strict=True)]
+    weights = progress_weights(progress, round(config.progress_seconds * episodes.fps))
+    print(f"imitated: {(weights > 0).mean():.0%} of the windows, which make progress")
+    return weights
 
 
 def _image_input(config: Config, episodes: "EpisodeSet") -> "ImageInputConfig | None":

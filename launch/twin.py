@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
+from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Seed, checked_dataclass
 from touchgoal.sim_envs.config import (
@@ -19,13 +20,12 @@ from touchgoal.sim_envs.config import (
     BeadMazeConfig,
     PickPlaceConfig,
     TaskConfig,
-    TaskName,
 )
 
 if TYPE_CHECKING:
     from touchgoal.control.cell.config import CellConfig
 
-ENVS: dict[TaskName, TaskConfig] = {
+ENVS: dict[SimulatedTask, TaskConfig] = {
     "pick-place": PickPlaceConfig(camera_size=STREAM_SIZE),
     "bead-maze": BeadMazeConfig(
         cameras=("front", "wrist"), camera_size=STREAM_SIZE, split="validation", n_wires=20
@@ -37,7 +37,7 @@ ENVS: dict[TaskName, TaskConfig] = {
 class Config:
     """Options of twin."""
 
-    task: TaskName = "pick-place"
+    task: SimulatedTask = "pick-place"
     """Task that the cell is set up for."""
     arm: Literal["fr3", "ur5e"] = "fr3"
     """FR3 with the Franka Hand, or UR5e with a Robotiq gripper."""

@@ -10,11 +10,15 @@ from lerobot.robots import Robot, RobotConfig
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
-from touchgoal.control.cell.connection import CellConnection, RealClock, connect_cell
+from touchgoal.control.cell.connection import (
+    CellConnection,
+    RealClock,
+    camera_formats,
+    connect_cell,
+)
 from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop, RunLog
 from touchgoal.control.interfaces import Actor, DriverError
-from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.launch.support.cell_run import check_cell
 from touchgoal.launch.support.confirm import confirm
 from touchgoal.runtime.errors import UserError
@@ -47,10 +51,8 @@ class TouchgoalRobot(Robot):
             raise UserError("give the cell file of an arm or of a twin, not of a simulated arm")
         features = ft.features_of(len(cell_limits(self._cell).arm.home))
         self._state, self._action = features[ft.STATE].names, features[ft.ACTION].names
-        self._images: dict[str, Any] = dict.fromkeys(self._cell.cameras, ft.CAMERA_SHAPE)
-        if tips := self._cell.fingertips:
-            shape = (*find_sensor(tips.sensor).image_shape, 3)
-            self._images |= dict.fromkeys(("tactile_left", "tactile_right"), shape)
+        formats = camera_formats(self._cell).items()
+        self._images = {key.removeprefix(ft.IMAGE_PREFIX): (*f[1:], 3) for key, f in formats}
         self._connection: CellConnection | None = None
 
     observation_features = property(lambda self: dict.fromkeys(self._state, float) | self._images)

@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.cell.config import CellConfig, SimulatedTask
 from touchgoal.control.deployment.actors import DeployedPolicy
 from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.deployment.user_policy import Policy, UserPolicy, find_user_policy
@@ -27,7 +27,7 @@ from touchgoal.policies.checkpoint import (
 from touchgoal.policies.config import POLICIES
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import PickPlaceConfig, TaskConfig, TaskName
+from touchgoal.sim_envs.config import PickPlaceConfig, TaskConfig
 from touchgoal.sim_envs.tasks import make_expert, task_name
 
 PolicyMaker = Callable[[Any], Actor]
@@ -36,7 +36,7 @@ AnyPolicy = str | Path | LearnedPolicy | Policy | type
 """A name or folder as for `--policy`, a loaded policy, or a user's class or an object of it."""
 
 
-def scripted(task: TaskName) -> str:
+def scripted(task: SimulatedTask) -> str:
     """Return the task's scripted policy that an arm can run."""
     return "follower" if task == "bead-maze" else "expert"
 
@@ -107,6 +107,8 @@ def choose_policy(policy: AnyPolicy, task: TaskConfig) -> PolicyMaker:
         return follower
     if (found := find_user_policy(name)) is not None:
         return found
+    if name == "shipped" and where not in SHIPPED_POLICIES:
+        raise UserError(f"no policy ships for {where}: train one, or take the expert")
     if name == "shipped":
         return SavedPolicy(SHIPPED_POLICIES[where])
     try:

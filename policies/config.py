@@ -121,13 +121,16 @@ class PoseEstimatorConfig:
     """Features of each keypoint."""
     width: Count = 256
     """Width of the hidden layers that combine them."""
+    sure: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Least share of the first look near the object and near the goal, and least length of the vector
+    of the yaw, in which the estimate is trusted; training sets them."""
 
 
 @checked_dataclass
 class PoseTrainConfig:
     """Training of the pose estimator, by AdamW."""
 
-    epochs: Count = 16
+    epochs: Count = 26
     """Passes over the placements."""
     batch_size: Count = 64
     """Placements in each step."""

@@ -9,11 +9,13 @@ import gymnasium as gym
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.for_rl import ForRL
+from touchgoal.sim_envs.fragile_carry import FragileCarry
 from touchgoal.sim_envs.pick_place import PickPlace
+from touchgoal.sim_envs.tasks import ENVIRONMENTS
 
 Touch = Literal["picture", "embedding"]
 Reward = Literal["progress", "touch"]
-_ENVIRONMENTS = {env.task: env for env in (PickPlace, BeadMaze)}
+_BY_NAME = {env.task: env for env in ENVIRONMENTS.values()}
 
 
 @overload
@@ -30,6 +32,13 @@ def make(
     for_rl: Literal[False] = False,
     **options: Any,
 ) -> BeadMaze: ...
+@overload
+def make(
+    task: Literal["fragile-carry"],
+    *,
+    for_rl: Literal[False] = False,
+    **options: Any,
+) -> FragileCarry: ...
 @overload
 def make(
     task: str,
@@ -59,7 +68,7 @@ def make(
         stable_baselines3.PPO("MultiInputPolicy", env).learn(100_000)
 
     Args:
-        task: "pick-place" or "bead-maze".
+        task: "pick-place", "bead-maze" or "fragile-carry".
         for_rl: keys without dots and actions in [-1, 1]; see `sim_envs.for_rl.ForRL`.
         touch: tactile images at a quarter of their size, or embeddings. This option and the next
             four need `for_rl`.
@@ -69,17 +78,17 @@ def make(
         encoder: touch encoder of embeddings and of reward "touch"; default: the one that ships for the
             sensor.
         options: fields of the task's config by name, such as `cameras=("front",)`,
-            `camera_size=(96, 96)` or `tactile=False`: see `PickPlaceConfig` and `BeadMazeConfig`.
-            For a field that is itself a config, a dict of its changed fields:
+            `camera_size=(96, 96)` or `tactile=False`: see `sim_envs/config.py`. For a field that is
+            itself a config, a dict of its changed fields:
             `randomization={"gain": 0.0}`. `render_mode="rgb_array"` is for video recorders.
 
     Raises:
         UserError: there is no such task or option, a value is out of its range, or a goal is
             missing.
     """
-    if task not in _ENVIRONMENTS:
-        raise UserError(f"unknown task {task!r}; choose from: {', '.join(_ENVIRONMENTS)}")
-    env: gym.Env = _ENVIRONMENTS[task](**options)
+    if task not in _BY_NAME:
+        raise UserError(f"unknown task {task!r}; choose from: {', '.join(_BY_NAME)}")
+    env: gym.Env = _BY_NAME[task](**options)
     if not for_rl:
         if (touch, reward, goal, normalizer, encoder) != ("picture", "progress", None, None, None):
             raise UserError("touch, reward, goal, normalizer and encoder need for_rl=True")

@@ -6,19 +6,16 @@ import io
 import json
 import resource
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from touchgoal import __version__
 from touchgoal.encoders.training.checkpoint import checksum
-from touchgoal.episodes.schema import Episode
+from touchgoal.rewards.embed_trajectories import Count, Embedded
 from touchgoal.rewards.goals import GoalSpec, content_checksum
 from touchgoal.rewards.report.record import record_of
 from touchgoal.rewards.report.report import write_report
-from touchgoal.rewards.report.thumbnails import Thumbnails
 from touchgoal.rewards.reward_model import RewardModel
-from touchgoal.rewards.sources.read_ahead import read_ahead
 from touchgoal.rewards.sources.trajectory import Skipped, Trajectory
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
@@ -26,6 +23,8 @@ from touchgoal.runtime.progress import progress_bar
 
 SKIPPED = "skipped.csv"
 _RECORDS = "measured"
+Embed = Callable[[Sequence[Trajectory], Count], Iterator[Embedded | Skipped]]
+"""Embeds trajectories in their order."""
 
 
 class Measurement:
@@ -58,17 +57,19 @@ class Measurement:
         """Records of the measured trajectories, in the order of the source."""
         return [path for path in self._paths.values() if path.is_file()]
 
-    def run(self, workers: int) -> str:
-        """Measure what is missing; add what cannot be read to `skipped`.
+    def run(self, embed: Embed) -> str:
+        """Measure what is missing, embedded by `embed`; add what cannot be read to `skipped`.
 
-        Each trajectory is on disk when the next one begins. `workers` threads read ahead. Return
-        number and rate of the frames and the largest memory, for people.
+        Each trajectory is on disk when the next one begins. Return number and rate of the frames and
+        the largest memory, for people.
         """
         done, began = 0, time.perf_counter()
         with progress_bar("measuring", sum(t.length for t in self.missing), "frame") as bar:
-            for trajectory, chunks in read_ahead(self.missing, workers):
+            for trajectory, result in zip(
+                self.missing, embed(self.missing, bar.update), strict=True
+            ):
                 try:
-                    self._measure(trajectory, _counted(chunks, bar))
+                    self._measure(result)
                 except UserError as error:
                     self.skipped.append(Skipped(trajectory.name, str(error)))
                 done += trajectory.length
@@ -78,19 +79,19 @@ class Measurement:
         rate = f"{done / seconds:.1f} a second, at most {memory:.2f} GB of memory"
         return f"{done:,} frames in {seconds:.0f} s: {rate}"
 
-    def _measure(self, trajectory: Trajectory, chunks: Iterable[Episode]) -> None:
-        model, name = self._models[trajectory.name], trajectory.name
-        thumbnails = Thumbnails(trajectory.length)
-        embedded = model.embedder.embed_chunks(
-            thumbnails.collect(chunks), trajectory.fps, trajectory.source
-        )
-        curves = model.curves(embedded)
+    def _measure(self, result: Embedded | Skipped) -> None:
+        if isinstance(result, Skipped):
+            self.skipped.append(result)
+            return
+        trajectory, name = result.trajectory, result.trajectory.name
+        model = self._models[name]
+        curves = model.curves(result.embedded)
         plot = name in self._plotted
         write_report(curves, self._out, name, model.provenance(), self._gamma, plot)
         path = self._paths[name]
         for stale in path.parent.glob(f"{name}.*.npz"):
             stale.unlink()
-        record_of(curves, trajectory, thumbnails, self._gamma).save(path)
+        record_of(curves, trajectory, result.thumbnails, self._gamma).save(path)
 
     def _content(self, spec: GoalSpec) -> str:
         """Return the checksum of a goal's content, read once: thousands of trajectories share it."""
@@ -128,10 +129,3 @@ def write_skipped(skipped: Sequence[Skipped], total: int, out: Path) -> str:
     writer.writerows((one.name, one.reason) for one in skipped)
     write_file(path, text.getvalue().encode())
     return f"{len(skipped):,} of {total:,} skipped, see {path}"
-
-
-def _counted(chunks: Iterable[Episode], bar: Any) -> Iterator[Episode]:
-    """Count the frames of a chunk as done when the next one is asked for."""
-    for chunk in chunks:
-        yield chunk
-        bar.update(len(chunk))

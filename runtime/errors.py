@@ -14,6 +14,10 @@ class UserError(ValueError):
     """
 
 
+class RefusedError(UserError):
+    """A policy does not act, because it is not sure of what it observes."""
+
+
 @dataclass(frozen=True)
 class CheckResult:
     """Result of a check: one line of a table."""

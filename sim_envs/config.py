@@ -1,7 +1,7 @@
 """Options of the simulated cell and of each task; light to import."""
 
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -17,6 +17,8 @@ from touchgoal.runtime.option_types import (
     Seed,
     checked_dataclass,
 )
+from touchgoal.sim_envs.cell.deployment import AS_DEPLOYED, IDEAL_DEPLOYMENT, DeploymentConfig
+from touchgoal.sim_envs.scene.objects import CATALOGUE
 from touchgoal.sim_envs.scene.objects import find as find_object
 from touchgoal.sim_envs.scene.wires import PER_FAMILY, TRAINED, Family, Split, Wire, choose
 from touchgoal.sim_envs.scene.wires import find as find_wire
@@ -51,7 +53,7 @@ into the table), overgripped (40 N), wrong_object (takes a distractor), same_sha
 the table has another material than the one asked for). By its place alone a slip, an edge_grasp or
 an overgripped object can still be a success of the task.
 """
-TaskName = Literal["pick-place", "bead-maze"]
+TaskName = Literal["pick-place", "bead-maze", "fragile-carry"]
 Camera = Literal["front", "wrist"]
 Indenter = Literal["sphere", "sharp", "flat"]
 """A probe of the indenter rig."""
@@ -140,12 +142,6 @@ class SceneConfig:
             )
 
 
-Delay = Annotated[float, Field(ge=0.0, le=0.2)]
-"""s"""
-DelayRange = Annotated[tuple[Delay, Delay], ORDERED]
-TickRange = Annotated[tuple[Annotated[int, Field(ge=0, le=2)], ...], Field(min_length=1)]
-
-
 def _one_or_three(changes: tuple[float, ...]) -> tuple[float, ...]:
     if len(changes) not in (1, 3):
         raise ValueError(f"takes one value, or red, green and blue, not {len(changes)} values")
@@ -156,63 +152,6 @@ BrightnessChange = Annotated[float, Field(ge=-0.95, le=1.0)]
 """As a share of the brightness; -0.15 is 15 % dimmer."""
 LightChange = Annotated[tuple[BrightnessChange, ...], AfterValidator(_one_or_three)]
 """Change of each colour channel's brightness as a share; one value for all three."""
-
-
-@checked_dataclass
-class DeploymentConfig:
-    """Delays and dynamics of a real arm, drawn for each episode.
-
-    Options not given follow `--env.as-deployed`: with it they are as over the wire, without it off.
-    """
-
-    tracker: bool | None = None
-    """Drive the arm as `deploy` does: servo lag, the safety layer's limits, the 1 kHz tracker, and
-    an arm that follows its set-points without lag."""
-    franka_hand: bool | None = None
-    """Act as a Franka Hand: one command at a time, each runs to its end; a target of 0 grasps, any
-    other width is a move. The width is read every 50 ms."""
-    estimated_wrench: bool | None = None
-    """Observe the force on the hand as a real arm estimates it: with noise, bias, drift and lag."""
-    state_delay: DelayRange | None = None
-    """Least and largest age of joint positions, velocities and force in an observation, s."""
-    picture_delay: DelayRange | None = None
-    """Least and largest age of camera and tactile images in an observation, s."""
-    picture_rate: Annotated[float, Field(ge=5, le=1000)] | None = None
-    """Frame rate of cameras and fingertip sensors, Hz. An observation holds the latest frame; as
-    deployed 30 Hz, else one frame per millisecond."""
-    command_delay: DelayRange | None = None
-    """Least and largest time from the policy's action until arm and hand receive it, s."""
-    jitter: DelayRange | None = None
-    """Range of an episode's jitter, s. Each tick adds a random part of it to each delay."""
-    plan_ticks: TickRange | None = None
-    """Control ticks by which a learned policy's plans are late; one of these is drawn."""
-
-
-IDEAL_DEPLOYMENT = DeploymentConfig(
-    tracker=False,
-    franka_hand=False,
-    estimated_wrench=False,
-    state_delay=(0.0, 0.0),
-    picture_delay=(0.0, 0.0),
-    picture_rate=1000.0,
-    command_delay=(0.0, 0.0),
-    jitter=(0.0, 0.0),
-    plan_ticks=(0,),
-)
-# Measured between `touchgoal deploy` and `touchgoal twin` (`touchgoal benchmark deploy`): states
-# are 7 to 18 ms old; commands take 20 to 25 ms with the tracker's lag; plans come a tick late.
-# Cameras and fingertips: 25 to 30 frames a second (GelSight Mini and DIGIT data sheets).
-AS_DEPLOYED = DeploymentConfig(
-    tracker=True,
-    franka_hand=True,
-    estimated_wrench=True,
-    state_delay=(0.005, 0.02),
-    picture_delay=(0.005, 0.02),
-    picture_rate=30.0,
-    command_delay=(0.005, 0.02),
-    jitter=(0.0, 0.02),
-    plan_ticks=(1,),
-)
 
 
 @checked_dataclass
@@ -231,8 +170,8 @@ class EnvConfig(SceneConfig):
     """Time limit of an episode, s."""
     disturbance: Annotated[NotNegative, Field(le=0.1)] = 0.0
     """Random hand motion added to each action, so that demonstrations show recoveries (DART, Laskey
-    2017): RMS speed along each axis, m/s. The hand also turns, at 2 rad/s (pick-place) or 20 rad/s
-    (bead-maze) per m/s."""
+    2017): RMS speed along each axis, m/s. The hand also turns, at 2 rad/s (in bead-maze 20 rad/s) per
+    m/s; in fragile-carry the squeeze varies, too."""
     randomization: Annotated[SensorRandomization, RARE] = SensorRandomization()
     """Differences between the two fingertip sensors, drawn for each episode."""
     light_change: Annotated[LightChange, RARE] = (0.0,)
@@ -250,6 +189,10 @@ class EnvConfig(SceneConfig):
         base = AS_DEPLOYED if self.as_deployed else IDEAL_DEPLOYMENT
         own = {name: value for name, value in vars(self.deployment).items() if value is not None}
         return replace(base, **own)
+
+    def reset_options(self, count: int | None = None) -> list[dict[str, Any]]:
+        """Return options of `reset` for episodes to take in turn, `count` of them if it matters."""
+        return [{}]
 
     def __post_init__(self) -> None:
         """Raise ValueError if a tick is no whole number of set-points, or an episode has none."""
@@ -289,6 +232,10 @@ class PickPlaceConfig(EnvConfig):
     release: bool = False
     """Success also requires that the hand lets go. The paper's reward curves end in touch, so by
     default an episode ends with the placed object still in the hand."""
+
+    def reset_options(self, count: int | None = None) -> list[dict[str, Any]]:
+        """Return each object once."""
+        return [{"object": name} for name in self.objects or CATALOGUE]
 
 
 Place = tuple[Annotated[float, Field(ge=0.3, le=0.7)], Annotated[float, Field(ge=-0.3, le=0.3)]]
@@ -352,6 +299,10 @@ class BeadMazeConfig(EnvConfig):
         named = [find_wire(name) for name in self.wires]
         return named if count is None else [named[i % len(named)] for i in range(count)]
 
+    def reset_options(self, count: int | None = None) -> list[dict[str, Any]]:
+        """Return one wire for each episode."""
+        return [{"wire": wire.name} for wire in self.chosen_wires(count)]
+
 
 @checked_dataclass
 class BeadMazeReset:
@@ -363,18 +314,49 @@ class BeadMazeReset:
     """Force of each finger, N."""
 
 
+@checked_dataclass
+class FragileCarryConfig(EnvConfig):
+    """Options of fragile-carry; reset's `options` override the random draws."""
+
+    sensor: str = "gelsight_mini_markers"
+    """Sensor on both fingertips: a name (`touchgoal list sensors`) or the folder of a sensor file
+    from `touchgoal calibrate`."""
+    cameras: tuple[Camera, ...] = ()
+    """Observed cameras; fewer is faster."""
+    hold_force: ForceRange = (1.0, 8.0)
+    """Range of the force of each finger that just holds the rod, N, drawn log-uniformly."""
+    mass: Annotated[tuple[Mass, Mass], ORDERED] = (0.1, 0.15)
+    """Range of the rod's mass, kg; the friction follows from it and the force that holds."""
+    crush_ratio: Annotated[float, Field(gt=1)] = 2.5
+    """Force of a finger that crushes the rod, relative to the force that just holds it."""
+    tug: Fraction = 0.35
+    """Greatest force of the tug on the carried rod, relative to the rod's weight."""
+
+
+@checked_dataclass
+class FragileCarryReset:
+    """Options of `FragileCarry.reset`, each in place of a random draw."""
+
+    hold_force: Force | None = None
+    """Force of each finger that just holds the rod, N."""
+    mass: Mass | None = None
+    """Mass of the rod, kg."""
+
+
 def _is_multiple(value: float, of: float) -> bool:
     return value / of >= 0.999 and abs(value / of - round(value / of)) < 1e-6
 
 
-TaskConfig = PickPlaceConfig | BeadMazeConfig
-TASKS: dict[TaskName, type[PickPlaceConfig] | type[BeadMazeConfig]] = {
+TaskConfig = PickPlaceConfig | BeadMazeConfig | FragileCarryConfig
+TASKS: dict[TaskName, type[TaskConfig]] = {
     "pick-place": PickPlaceConfig,
     "bead-maze": BeadMazeConfig,
+    "fragile-carry": FragileCarryConfig,
 }
 ENVS: dict[TaskName, TaskConfig] = {
     "pick-place": PickPlaceConfig(),
     "bead-maze": BeadMazeConfig(split="validation"),
+    "fragile-carry": FragileCarryConfig(),
 }
 """Environments in which policies are tried."""
 

@@ -1,6 +1,6 @@
 """The task of the paper's robot experiment: pick an object up and place it at a goal."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene.build import VISUAL_GROUP
 from touchgoal.sim_envs.scene.objects import CATALOGUE, find, sample_body
 
+Hand = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, " j"]]
+"""Joints (rad) of an arm for objects at these positions on the table (m, base frame)."""
 WORKSPACE = ((0.40, 0.60), (-0.20, 0.20))  # m, where objects start and goals lie, base frame
 _LIFTED = 0.03  # m above rest that counts as picked up
 _MOST_MISSES = 200  # draws too near to another place, after which all places are drawn again
@@ -66,11 +68,12 @@ class PickPlace(FrankaTactileEnv):
             yaw += np.pi / 2  # close along the narrower side
         return float((yaw + np.pi / 2) % np.pi - np.pi / 2)
 
-    def rearrange(self) -> tuple[Observation, dict[str, Any]]:
+    def rearrange(self, hand: Hand | None = None) -> tuple[Observation, dict[str, Any]]:
         """Start a new episode with the same objects, without the cost of a reset.
 
         Objects, goal and hand are moved to places that a reset could draw; objects keep the side
-        they lie on.
+        they lie on. `hand` (objects' positions on the table, m, base frame -> joints, rad) says
+        where the hand is instead.
         """
         rng, data = self.np_random, self.data
         *positions, self.goal = _random_positions(rng, len(self.bodies) + 1)
@@ -81,7 +84,8 @@ class PickPlace(FrankaTactileEnv):
             mujoco.mju_mulQuat(
                 pose[3:], np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]), pose[3:].copy()
             )
-        self.command = self._command_before = self.start_joints(rng)
+        at = np.array(positions)
+        self.command = self._command_before = hand(at) if hand else self.start_joints(rng)
         data.qpos[self.arm_positions] = self.command
         data.qvel[:] = 0
         self.update_contacts()

@@ -3,29 +3,48 @@
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import BeadMazeConfig, EnvConfig, Outcome, TaskConfig, TaskName
+from touchgoal.sim_envs.config import (
+    TASKS,
+    BeadMazeConfig,
+    EnvConfig,
+    FragileCarryConfig,
+    Outcome,
+    PickPlaceConfig,
+    TaskConfig,
+    TaskName,
+)
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
+from touchgoal.sim_envs.experts.fragile_carry import FragileCarryExpert
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
+from touchgoal.sim_envs.fragile_carry import FragileCarry
 from touchgoal.sim_envs.pick_place import PickPlace
+
+ENVIRONMENTS: dict[type[TaskConfig], type[PickPlace | BeadMaze | FragileCarry]] = {
+    PickPlaceConfig: PickPlace,
+    BeadMazeConfig: BeadMaze,
+    FragileCarryConfig: FragileCarry,
+}
 
 
 def make_env(config: TaskConfig) -> FrankaTactileEnv:
     """Make the environment of a task's config."""
-    return BeadMaze(config) if isinstance(config, BeadMazeConfig) else PickPlace(config)
+    return ENVIRONMENTS[type(config)](config)
 
 
 def task_name(config: EnvConfig) -> TaskName:
     """Return the commands' name of a config's task."""
-    return "bead-maze" if isinstance(config, BeadMazeConfig) else "pick-place"
+    return next(name for name, kind in TASKS.items() if isinstance(config, kind))
 
 
 def make_expert(
     env: FrankaTactileEnv, outcome: Outcome = "success"
-) -> PickPlaceExpert | BeadMazeExpert:
+) -> PickPlaceExpert | BeadMazeExpert | FragileCarryExpert:
     """Make the expert for an environment after its reset."""
     if isinstance(env, PickPlace):
         return PickPlaceExpert(env, outcome)
-    assert isinstance(env, BeadMaze)
     if outcome != "success":
-        raise UserError(f"the bead maze's expert cannot {outcome!r}; ask for outcome success")
-    return BeadMazeExpert(env)
+        raise UserError(f"the expert of {env.task} cannot {outcome!r}; ask for outcome success")
+    if isinstance(env, BeadMaze):
+        return BeadMazeExpert(env)
+    assert isinstance(env, FragileCarry)
+    return FragileCarryExpert(env)

@@ -24,12 +24,15 @@ class _InProcess(Executor):
             future.set_exception(error)
         return future
 
+    def end_at_once(self) -> None:
+        """All work is done."""
+
 
 @contextmanager
 def in_process_workers() -> Iterator[None]:
     """A process takes seconds to start; where its isolation is not the subject, none does."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worker_pool, "ProcessPoolExecutor", lambda *_, **__: _InProcess())
+        patch.setattr(worker_pool, "WorkerPool", lambda _: _InProcess())
         yield
 
 

@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 from touchgoal.control.cell import twin_client
@@ -61,6 +62,13 @@ class RunningTwin:
         """Reset the cell once the arm is at rest."""
         self.at_rest()
         self.ask(line)
+
+    def pause_pictures(self, seconds: float) -> None:
+        """Let the process that draws its pictures stand still for a while."""
+        pid = self._process.pid
+        (drawing,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        os.kill(int(drawing), signal.SIGSTOP)
+        Timer(seconds, os.kill, (int(drawing), signal.SIGCONT)).start()
 
     def close(self) -> None:
         """End the twin by Ctrl-C."""

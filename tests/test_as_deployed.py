@@ -9,7 +9,8 @@ import pytest
 from touchgoal.control import features as ft
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.sim_envs.bead_maze import BeadMaze
-from touchgoal.sim_envs.config import BeadMazeConfig, DeploymentConfig, PickPlaceConfig
+from touchgoal.sim_envs.cell.deployment import DeploymentConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 
 BLIND = PickPlaceConfig(cameras=(), tactile=False)

@@ -10,6 +10,7 @@ import pytest
 from in_process import in_process_workers, run
 from toy_episodes import record
 
+from touchgoal.benchmarks.papers import mixed_demonstrations, reward_use
 from touchgoal.benchmarks.papers.reward_quality import benchmark, recording
 from touchgoal.control import features as ft
 from touchgoal.encoders import pretrained
@@ -215,16 +216,23 @@ def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
     assert "MISSING" not in printed and "two tactile + one 128x128 camera" in printed
 
 
+@pytest.fixture
+def few_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Benchmarks of the reward with two objects on either side, and a value that hardly learns."""
+    monkeypatch.setattr(recording, "HELD_OUT_OBJECTS", ("brick", "toy_brick"))
+    monkeypatch.setattr(mixed_demonstrations, "HELD_OUT_OBJECTS", ("brick", "toy_brick"))
+    monkeypatch.setattr(recording, "TRAINING_OBJECTS", ("candle", "soda_can"))
+    monkeypatch.setattr("touchgoal.rewards.value.fit_value._STEPS", 5)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_objects")
 def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kinds = ("never_touch", "drop", "wrong_object", "overgripped")
     outcomes = ("success", "slow", "regrasped", *kinds)
     monkeypatch.setattr(recording, "OUTCOMES", outcomes)  # test_envs.py has the others
     monkeypatch.setattr(benchmark, "KINDS", kinds)
     monkeypatch.setattr(benchmark, "TRUE_KINDS", kinds[:-1])
-    monkeypatch.setattr(recording, "HELD_OUT_OBJECTS", ("brick", "toy_brick"))
-    monkeypatch.setattr(recording, "TRAINING_OBJECTS", ("candle", "soda_can"))
-    monkeypatch.setattr("touchgoal.rewards.value.fit_value._STEPS", 5)
     sizes = "--episodes 1 --suboptimal 1 --successes 2 --training 4 --goals 1 --calibration 9"
     words = f"benchmark reward-quality {sizes} --scenes fixed --every 2 --env.control-hz 5"
     run(*words.split(), "--env.camera-size", 64, 64, "--out", tmp_path)
@@ -232,6 +240,26 @@ def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert set(result["auc"]) == {*kinds, "mean of true kinds"}
     assert result["episodes"] == dict.fromkeys(outcomes, 1) | {"success": 2}
     assert result["success"]["demonstrations"] == 9 and len(result["claims"]) >= 4
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_objects")
+def test_benchmark_reward_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reward_use, "_TASK", PickPlaceConfig(objects=("brick",), max_seconds=1))
+    sizes = "--training 4 --goals 1 --demonstrations 4 --validation 1 --seeds 1 --trials 1"
+    words = f"benchmark reward-use {sizes} --checkpoints 1 --rollouts 1 --train.epochs 1"
+    rows = ("--weights", "none", "fused")
+    run(*words.split(), *rows, "--env.camera-size", 64, 64, "--out", tmp_path)
+    used = json.loads((tmp_path / "metrics.json").read_text())
+    assert used["imitation"]["none"][0]["used"] == 1 > used["imitation"]["fused"][0]["used"]
+    assert len(used["checkpoints"]) == 1
+
+
+@pytest.mark.slow
+def test_grasps_are_found_by_trial(tmp_path: Path) -> None:
+    sizes = "--scenes 1 --rounds 1 --samples 6 --goals 1 --error 0.01 --env.control-hz 10"
+    run("benchmark", "grasp-search", *sizes.split(), "--out", tmp_path)
+    assert json.loads((tmp_path / "metrics.json").read_text())["lifted"]["fused"] == [True]
 
 
 def test_an_encoder_is_trained_and_validated_on_fit_data(

@@ -11,12 +11,14 @@ import subprocess
 import sys
 import time
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_cell import SIM, FakeCell, write_cell_file
 from in_process import run
+from rerun_rows import rerun_rows, rerun_views
 from running_twin import RunningTwin
 
 from touchgoal.control import features as ft
@@ -79,9 +81,17 @@ def test_a_stalled_camera_stops_the_arm_and_the_episode_is_kept(tmp_path: Path) 
 
 
 def test_a_simulated_arm_does_the_job(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    run("deploy", write_cell_file(tmp_path, SIM), "--execute", "--yes", "--out", tmp_path / "run")
+    file = write_cell_file(tmp_path, SIM)
+    shown = ["--rerun", tmp_path / "a.rrd"] if find_spec("rerun") else []
+    run("deploy", file, "--execute", "--yes", "--out", tmp_path / "run", *shown)
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    meta = EpisodeSet(tmp_path / "run" / "episodes").meta(0)
+    episodes = EpisodeSet(tmp_path / "run" / "episodes")
+    meta = episodes.meta(0)
+    if shown:
+        rows = rerun_rows(tmp_path / "a.rrd")
+        assert rows["/arm/front"] == rows["/arm/force (N)/force"] == episodes.lengths[0]
+        plots = {"force (N)", "gripper width (mm)", "joint change (rad)"}
+        assert rerun_views(tmp_path / "a.rrd") == {"front"} | plots
     assert metrics["success"] and meta["arm"] == "sim" and meta["success"] is True
     printed = capsys.readouterr().out
     assert "the hand still holds something" in printed and "task: done" in printed

@@ -60,7 +60,8 @@ def test_command_is_understood(command: Command, capsys: pytest.CaptureFixture, 
         assert not command.whole and "required" in complaint.lower(), complaint
 
 
-TARGETS = "demo weights weights-markers maze-policy maze-wrench-policy pick-place-policy".split()
+POLICIES = "maze-policy maze-wrench-policy pick-place-policy fragile-carry".split()
+TARGETS = ["demo", "weights", "weights-markers", *POLICIES]
 
 
 @pytest.mark.parametrize("target", TARGETS)

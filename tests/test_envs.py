@@ -17,13 +17,13 @@ from touchgoal.episodes.recording import EpisodeSpec, episode_spec, record_episo
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import BeadMazeConfig, Outcome, PickPlaceConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, FragileCarryConfig, Outcome, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE, SHAPES
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
 
-ENVS = ["touchgoal/PickPlace-v0", "touchgoal/BeadMaze-v0"]
+ENVS = ["touchgoal/PickPlace-v0", "touchgoal/BeadMaze-v0", "touchgoal/FragileCarry-v0"]
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
 STILL = np.zeros(8)
 
@@ -116,7 +116,9 @@ gym.vector.AsyncVectorEnv([make], context="fork").reset(seed=0)
 
 
 @pytest.mark.parametrize("arm", ["fr3", "ur5e"])
-@pytest.mark.parametrize("config", [BLIND, BeadMazeConfig(tactile=False)])
+@pytest.mark.parametrize(
+    "config", [BLIND, BeadMazeConfig(tactile=False), FragileCarryConfig(tactile=False)]
+)
 def test_expert_is_recorded_on_every_arm(config: TaskConfig, arm: Literal["fr3", "ur5e"]) -> None:
     env = make_env(replace(config, max_seconds=0.6, arm=arm))
     episode = record_episode(env, EpisodeSpec(seed=0))

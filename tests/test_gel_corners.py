@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from fake_cell import SIM, write_cell_file
 
+from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
-from touchgoal.control.cell.connection import _tactile_camera
+from touchgoal.control.cell.connection import connect_camera
 from touchgoal.control.sensors.tactile_camera import NO_CROP, fingertip_view, rectify
 from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
 from touchgoal.runtime.errors import UserError
@@ -91,6 +92,6 @@ def test_a_cell_file_has_the_corners_of_either_gel(tmp_path: Path) -> None:
     cell = read_cell_file(write_cell_file(tmp_path, tips + SIM))
     assert cell.fingertips is not None and cell.fingertips.corners == (corners, mirrored)
     for side, gel in enumerate((corners, mirrored)):
-        camera = _tactile_camera(cell, cell.fingertips, side)
+        camera = connect_camera(cell, ft.TACTILE[side])
         np.testing.assert_array_equal(camera.read().image, rectify(picture, SHAPE, gel))
         camera.close()

@@ -8,6 +8,7 @@ from typing import cast
 import numpy as np
 import pytest
 import torch
+from rerun_rows import rerun_rows
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.weights import WeightsFormat
@@ -250,6 +251,10 @@ def test_the_films_show_the_trials(tmp_path: Path) -> None:
     frames, fps = read_frames(tmp_path / "worst.mp4")
     assert fps == 10 and len(frames) == 6
     assert sorted(p.name for p in tmp_path.iterdir()) == ["best.mp4", "worst.mp4"]
+    pytest.importorskip("rerun", reason="extra viz")
+    recording = tmp_path / "a.rrd"
+    film_trials(None, config, specs, trials, PickPlaceExpert, workers=1, rerun=str(recording))
+    assert rerun_rows(recording)["/worst/scene"] == 11
 
 
 def test_a_tick_embeds_like_its_episode_and_another_size_is_refused() -> None:

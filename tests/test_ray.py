@@ -3,16 +3,20 @@
 import math
 import multiprocessing
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from in_process import in_process_workers
 
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
+from touchgoal.rewards.report.frame_table import FRAMES
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 
@@ -49,6 +53,11 @@ def test_a_node_may_be_lost(cluster: Any, tmp_path: Path, monkeypatch: pytest.Mo
     for file in files:
         assert file.read_bytes() == (on_ray / file.relative_to(local)).read_bytes(), file
     assert EpisodeSet(on_ray / "episodes").checksum == EpisodeSet(local / "episodes").checksum
+    curves = ["reward-curves", str(local / "episodes"), "--plots", "0", "--out"]
+    main([*curves, str(tmp_path / "here")])
+    main([*curves, str(tmp_path / "there"), "--ray", cluster.address])
+    here, there = (pq.read_table(tmp_path / out / FRAMES) for out in ("here", "there"))
+    assert here.num_rows and here.equals(there)
 
 
 def test_errors_are_the_same(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,9 +73,22 @@ def test_errors_are_the_same(cluster: Any, tmp_path: Path, monkeypatch: pytest.M
         main([*refused, cluster.address])
 
 
-def test_a_killed_process_loses_nothing() -> None:
-    with parallel_map(math.sqrt, range(100), 2) as roots:
-        first = next(roots)
-        for worker in multiprocessing.active_children():
-            worker.kill()
-        assert [first, *roots] == [math.sqrt(i) for i in range(100)]
+@pytest.mark.parametrize(
+    "function", [math.sqrt, partial(np.full, 5_000_000)], ids=["computing", "sending its result"]
+)
+def test_a_killed_process_loses_nothing(function: Callable[[int], Any]) -> None:
+    with parallel_map(function, range(12), 2) as results:
+        first = next(results)
+        multiprocessing.active_children()[0].kill()
+        found = [first, *results]
+    assert all(np.array_equal(f, function(i)) for i, f in enumerate(found)) and len(found) == 12
+
+
+def test_an_error_while_large_results_come_ends_the_workers() -> None:
+    with (
+        pytest.raises(UserError, match="disk"),
+        parallel_map(np.ones, [20_000_000] * 20, 2) as results,
+    ):
+        next(results)
+        raise UserError("the disk is full")
+    assert not multiprocessing.active_children()

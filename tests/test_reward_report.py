@@ -6,12 +6,14 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
+from rerun_rows import rerun_rows
 from test_episode_embedder import recorded
 from test_success import facts
 from toy_towers import PaintTowers
@@ -20,6 +22,7 @@ from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.rewards.default_goal import goals_of
+from touchgoal.rewards.embed_trajectories import embed_here
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import Bank, Goal, GoalPicture, OwnFrame
 from touchgoal.rewards.measure import Measurement, write_skipped
@@ -49,7 +52,7 @@ def episodes(tmp_path: Path) -> Path:
 def measure(source: Path, out: Path, model: RewardModel = MODEL) -> Measurement:
     trajectories = open_source(source, "front", with_touch=False).trajectories
     measurement = Measurement(trajectories, lambda _: model, out, gamma=1.0, plots=1)
-    measurement.run(workers=2)
+    measurement.run(partial(embed_here, embedder=model.embedder, workers=2))
     report_all(measurement.records, out, model.provenance())
     return measurement
 
@@ -206,18 +209,13 @@ def test_page_holds_everything(pages: Callable[..., Path]) -> None:
 def test_a_recording_for_rerun(episodes: Path, tmp_path: Path) -> None:
     """Read back by rerun itself: pictures of camera and fingertips, and curves, at every frame."""
     pytest.importorskip("rerun", reason="extra viz")
-    from rerun.chunk import RrdReader  # pyright: ignore[reportMissingImports]
-
     from touchgoal.rewards.report.rerun_recording import write_recording
 
     measurement = measure(episodes, tmp_path / "out")
     trajectories = open_source(episodes, "front").trajectories
-    write_recording(tmp_path / "curves.rrd", trajectories, measurement.records)
-    chunks = list(RrdReader(tmp_path / "curves.rrd").stream())
-    rows: dict[str, int] = {}
-    for chunk in chunks:
-        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
-    for part in ("front", "tactile_left", "tactile_right", "curves/cost_image"):
+    write_recording(str(tmp_path / "curves.rrd"), trajectories, measurement.records)
+    rows = rerun_rows(tmp_path / "curves.rrd")
+    for part in ("front", "tactile_left", "tactile_right", "cost/image"):
         assert rows[f"/episode_000/{part}"] == trajectories[0].length
 
 

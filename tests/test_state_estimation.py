@@ -4,6 +4,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -13,16 +14,21 @@ from touchgoal.control import features as ft
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.episodes.recording import CORRECTED, EpisodeSpec, record_episode
 from touchgoal.policies import checkpoint
-from touchgoal.policies.checkpoint import SavedPolicy
+from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig
 from touchgoal.policies.perception.placements import Placements, render_placements
-from touchgoal.policies.perception.pose_estimator import PoseEstimator
+from touchgoal.policies.perception.pose_estimator import Look, PoseEstimator
 from touchgoal.policies.perception.pose_training import pose_errors, train_pose_estimator
-from touchgoal.policies.perception.state_estimation import ESTIMATED, StateEstimator
-from touchgoal.policies.perception.target_words import Look, embed, sentence
+from touchgoal.policies.perception.state_estimation import (
+    ESTIMATED,
+    StateEstimator,
+    load_pose_estimator,
+)
+from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed, sentence
+from touchgoal.policies.perception.target_words import Look as Shown
 from touchgoal.policies.training.dagger import DaggerRoles
 from touchgoal.runtime import seeds
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import RefusedError, UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE
@@ -81,6 +87,40 @@ def test_a_hand_that_starts_elsewhere_than_in_training_is_refused() -> None:
             StateEstimator(network)._begin(tick)
 
 
+def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two looks must agree; a look that is not sure counts for nothing, a first one ends it."""
+    estimator = StateEstimator(PoseEstimator(replace(SMALL, sure=(0.3, 0.3, 0.5))).eval())
+    now = {"x": 0.0, "sure": 1.0}
+
+    def look(*_: object) -> Look:
+        start = torch.tensor([[now["x"], 0, 0, 1, 0, 0.3, 0.3]])
+        return Look(start, torch.full((1, 2), now["sure"]), torch.ones(1))
+
+    monkeypatch.setattr(PoseEstimator, "look", look)
+    gel = np.full((120, 160, 3), 90, np.uint8)
+    first = dict.fromkeys(ft.TACTILE, gel) | {ft.TCP_POSE: np.full(7, 0.3, np.float32)}
+    first[ft.FRONT] = np.zeros((32, 32, 3), np.uint8)
+    touch = dict.fromkeys(ft.TACTILE, cv2.circle(gel.copy(), (80, 60), 20, (190, 20, 140), -1))
+    seen = []
+    steps = ((0.0, 1.0, {}), (0.5, 0.1, {}), *[(0.5, 1.0, {})] * 2, *[(0.9, 1.0, touch)] * 2)
+    for now["x"], now["sure"], more in steps:
+        tick = {**first, **more} if seen else first
+        seen.append(estimator.estimate(tick, first)[ft.TRUTH_START][0])
+    assert seen == pytest.approx([0, 0, 0, 0.5, 0.5, 0.5])
+    now["sure"] = 0.2
+    with pytest.raises(RefusedError, match="where the object is .0.20 sure, 0.30 needed"):
+        estimator.estimate(dict(first), dict(first))
+
+
+def test_a_hand_tilted_by_a_thousandth_changes_no_estimate() -> None:
+    """In training it never is, and inverse kinematics leaves 1e-9: no information, but a small unit."""
+    network = load_pose_estimator(SHIPPED_POLICIES["pick-place"] / ESTIMATOR)
+    pictures = {ft.FRONT: torch.full((1, 256, 256, 3), 90, dtype=torch.uint8)}
+    hand, words = torch.tensor([[0.45, 0, 0.26, 0, 1, 0, 0]]), torch.zeros(1, WORDS_WIDTH)
+    tilted = hand + torch.tensor([[0, 0, 0, 1e-3, 0, 0, 1e-3]])
+    torch.testing.assert_close(network(pictures, tilted, words), network(pictures, hand, words))
+
+
 def train_pose(
     count: int, epochs: int, out: Path, options: TrainerOptions
 ) -> tuple[Placements, PoseEstimator]:
@@ -108,7 +148,7 @@ def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
 def test_a_sentence_fits_its_object_alone() -> None:
     rng = np.random.default_rng(0)
     looks = [
-        Look(CATALOGUE[name], np.array(CATALOGUE[name].material.rgba[:3]), painted=False)
+        Shown(CATALOGUE[name], np.array(CATALOGUE[name].material.rgba[:3]), painted=False)
         for name in ("toy_brick", "brick", "golf_ball")
     ]
     said = [{sentence(rng, a, [b for b in looks if b is not a]) for _ in range(60)} for a in looks]

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from touchgoal.control.features import FRONT
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.surroundings import Surroundings
@@ -16,7 +17,7 @@ def pictured(**options: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the front camera's image and the middle (column, row) of the goal's green disc in it."""
     config = PickPlaceConfig(tactile=False, cameras=("front",), camera_size=(SIZE, SIZE), **options)
     env = PickPlace(config)
-    image = env.reset(seed=3)[0]["observation.images.front"].astype(int)
+    image = env.reset(seed=3)[0][FRONT].astype(int)
     env.close()
     green = image[..., 1] > 1.5 * image[..., 0]
     return image, np.argwhere(green).mean(0)[::-1]
@@ -62,3 +63,15 @@ def test_objects_grow_lose_friction_and_are_moved_after_a_second() -> None:
         changed.step(stay)
     moves = np.linalg.norm(np.diff(places, axis=0), axis=1)
     assert moves[:-1].max() < 2e-4 and moves[-1] == pytest.approx(0.02, abs=2e-3)
+
+
+def test_a_kept_opengl_context_draws_what_a_new_one_draws() -> None:
+    """A pebble has a mesh of its own, which lies in the context; balls and bricks share one."""
+    config = PickPlaceConfig(tactile=False, cameras=("front",), camera_size=(64, 64))
+    kept = PickPlace(config)
+    for seed, name in enumerate(("golf_ball", "pebble", "brick", "walnut", "golf_ball")):
+        new, options = PickPlace(config), {"object": name}
+        one, other = (e.reset(seed=seed, options=options)[0][FRONT] for e in (kept, new))
+        np.testing.assert_array_equal(one, other)
+        new.close()
+    kept.close()

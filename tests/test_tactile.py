@@ -1,9 +1,11 @@
 """Simulated tactile pictures: what they show, sensor by sensor; random surfaces and their encoder."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numba import typeof
 
 from touchgoal.control.tactile.sensor_calibration import shade
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI as MINI
@@ -47,6 +49,13 @@ def inside(kind: int, p: np.ndarray, size: np.ndarray) -> np.ndarray:
         return (side <= size[0]) & (np.abs(p[..., 2]) <= size[1])
     beyond = np.maximum(np.abs(p[..., 2]) - size[1], 0)
     return side**2 + beyond**2 <= size[0] ** 2
+
+
+def test_a_process_that_is_sent_a_sensor_runs_the_code_that_is_compiled() -> None:
+    """Numba compiles again for a read-only array, and an arm would wait for it."""
+    arrays = INSTANCE.background, INSTANCE.noise, INSTANCE.illumination
+    sent = pickle.loads(pickle.dumps(arrays))
+    assert [typeof(a) for a in sent] == [typeof(a) for a in arrays]
 
 
 @pytest.mark.parametrize("kind", [BOX, CYLINDER, SPHERE, CAPSULE])

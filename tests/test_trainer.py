@@ -171,10 +171,16 @@ def two_runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     torchrun = "-W error::FutureWarning -m torch.distributed.run --standalone".split()
     done = subprocess.run(
         [sys.executable, *torchrun, "--nproc-per-node=2", str(script), str(folder / "2")],
-        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "error::FutureWarning"},
-        capture_output=True,
+        env={
+            **os.environ,
+            "OMP_NUM_THREADS": "1",
+            "PYTHONFAULTHANDLER": "1",
+            "PYTHONWARNINGS": "error::FutureWarning",
+        },
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
     )
-    assert done.returncode == 0, done.stderr.decode()[-3000:]
+    assert done.returncode == 0, done.stdout.decode()[-9000:]
     return folder / "1", folder / "2"
 
 

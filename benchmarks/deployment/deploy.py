@@ -24,6 +24,7 @@ from touchgoal.benchmarks.deployment.deployed_episode import (
 )
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
+from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.policies.by_name import prepare_policy, scripted
 from touchgoal.policies.evaluation.evaluate import run_trial, trial_specs
@@ -32,7 +33,7 @@ from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Positive, Seed, checked_dataclass
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskName
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 
 Arm = Literal["environment", "in-process", "lock-step", "real-time"]
 
@@ -41,7 +42,7 @@ Arm = Literal["environment", "in-process", "lock-step", "real-time"]
 class Config(BenchmarkOptions):
     """Options of benchmark deploy."""
 
-    tasks: tuple[TaskName, ...] = ("pick-place", "bead-maze")
+    tasks: tuple[SimulatedTask, ...] = ("pick-place", "bead-maze")
     """Tasks."""
     policies: tuple[str, ...] = ("scripted", "shipped")
     """Policies, named as for deploy; scripted: the task's own, the expert or the follower."""
@@ -78,7 +79,7 @@ def run(config: Config) -> dict[str, Any]:
     return {"table": "\n".join(lines), "deployments": [asdict(row) for row in done]}
 
 
-def _scenes(task: TaskName, config: Config) -> Iterator[Scene]:
+def _scenes(task: SimulatedTask, config: Config) -> Iterator[Scene]:
     """Yield test wires, or each object in turn."""
     drawn = BeadMazeConfig(split="test") if task == "bead-maze" else PickPlaceConfig()
     for spec in trial_specs(drawn, config.episodes, config.seed):

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from touchgoal.control import features as ft
+from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.config import TaskName
 
 _TIMEOUT = 1800.0  # s for one deployment on a loaded machine
 _START_TIMEOUT, _END_TIMEOUT = 300.0, 60.0  # s for a twin, on a loaded machine
@@ -25,7 +25,7 @@ _SHUT = 0.01  # m that fingers must have closed for an attempted grasp
 class Scene:
     """One episode that environment, twin and cell file draw alike."""
 
-    task: TaskName
+    task: SimulatedTask
     seed: int
     item: str  # object or wire
 

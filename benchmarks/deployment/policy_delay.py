@@ -10,13 +10,8 @@ from typing import Any
 
 from touchgoal.benchmarks.deployment.trials import TrialOptions, try_cases
 from touchgoal.runtime.option_types import NotNegative, Positive, checked_dataclass
-from touchgoal.sim_envs.config import (
-    AS_DEPLOYED,
-    ENVS,
-    IDEAL_DEPLOYMENT,
-    DeploymentConfig,
-    TaskName,
-)
+from touchgoal.sim_envs.cell.deployment import AS_DEPLOYED, IDEAL_DEPLOYMENT, DeploymentConfig
+from touchgoal.sim_envs.config import ENVS, TaskName
 
 
 @checked_dataclass

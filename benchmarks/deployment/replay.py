@@ -24,7 +24,8 @@ from touchgoal.control.safety.limits import Box, RobotLimits
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.cell.deployed_arm import measurements_at_rest
-from touchgoal.sim_envs.config import DeploymentConfig, PickPlaceConfig
+from touchgoal.sim_envs.cell.deployment import DeploymentConfig
+from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 
 

@@ -8,9 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 from touchgoal.benchmarks.deployment.trials import UNCHANGED, DeployedOptions, try_cases
+from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
-from touchgoal.sim_envs.config import TaskConfig, TaskName
+from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.scene.objects import NEW_KINDS
 from touchgoal.sim_envs.scene.wires import HELD_OUT
 from touchgoal.sim_envs.surroundings import Surroundings
@@ -23,7 +24,7 @@ _DELAYED = {  # state and pictures; at 20 Hz a tick is 50 ms
     for ticks, s in ((2, 0.1), (4, 0.2))
 }
 _FROZEN = {"every second picture frozen": {"picture_rate": 10.0}}
-_CHANGES: dict[TaskName, dict[str, dict[str, Any]]] = {
+_CHANGES: dict[SimulatedTask, dict[str, dict[str, Any]]] = {
     "pick-place": {
         **_LIGHT,
         "1 other object, target named": {"distractors": 1},
@@ -73,7 +74,7 @@ def run(config: Config) -> dict[str, Any]:
     return try_cases(config, cases)
 
 
-def _environments(config: Config, task: TaskName) -> dict[str, TaskConfig]:
+def _environments(config: Config, task: SimulatedTask) -> dict[str, TaskConfig]:
     base = config.environment(task)
     late = {
         name: replace(base, deployment=replace(base.deployment, **change))

@@ -3,14 +3,15 @@
 import sys
 from collections.abc import Iterable
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.policies.by_name import choose_policy
 from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy
-from touchgoal.policies.evaluation.evaluate import Evaluation, evaluate
+from touchgoal.policies.evaluation.evaluate import REFUSED, Evaluation, evaluate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import (
@@ -18,7 +19,6 @@ from touchgoal.sim_envs.config import (
     BeadMazeConfig,
     PickPlaceConfig,
     TaskConfig,
-    TaskName,
 )
 
 UNCHANGED = "unchanged"  # row of a table
@@ -43,12 +43,12 @@ class TrialOptions(BenchmarkOptions):
 class DeployedOptions(TrialOptions):
     """Options of a benchmark that tries a policy in several tasks, as deployed."""
 
-    tasks: tuple[TaskName, ...] = tuple(ENVS)
+    tasks: tuple[SimulatedTask, ...] = get_args(SimulatedTask)
     """Tasks; the maze is on test wires."""
     as_deployed: bool = True
     """Let the arm behave as deployed."""
 
-    def environment(self, task: TaskName) -> TaskConfig:
+    def environment(self, task: SimulatedTask) -> TaskConfig:
         """Return a task's options: of the maze test wires, the hand up to 10 degrees askew."""
         base = replace(ENVS[task], as_deployed=self.as_deployed)
         if isinstance(base, BeadMazeConfig):
@@ -87,4 +87,5 @@ def table_row(what: str, result: Evaluation) -> str:
     """Return a line of the table under `TABLE_HEAD`."""
     peak = [trial.peak_force for trial in result.trials]
     force = f"{np.mean(peak):>19.1f}{np.std(peak):>6.1f}{max(peak):>6.1f}"
-    return f"{what:<46}{result!s:<24}{force}"
+    refused = sum(trial.failure == REFUSED for trial in result.trials)
+    return f"{what:<46}{result!s:<24}{force}" + f"  {refused} refused" * bool(refused)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.arms.driver_process import NEVER, DriverProcess
+from touchgoal.control.arms.driver_process import NEVER, DriverProcess, error_line
 from touchgoal.control.interfaces import STOPPED_ON_REQUEST, ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker, TrackerState
@@ -132,9 +132,15 @@ class ArmClient(ABC):
         self._streams = True
 
     def advance(self, time: float) -> bool:
-        """Tick at a twin's time (s); return whether the stream drives the arm."""
+        """Tick at a twin's time (s); return whether the stream drives the arm.
+
+        A lost link is the arm's fault from then on.
+        """
         self._twin_time = time
-        self.tick()
+        try:
+            self.tick()
+        except Exception as error:  # of any client library
+            self._refuse_from_now_on(error_line(error))
         return self._streams
 
     def close(self) -> None:

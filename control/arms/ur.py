@@ -21,6 +21,7 @@ _GAIN = 300.0  # servoJ's gain, 100 to 2000; URScript's default
 _LOOKAHEAD = 0.03, 0.2  # s, servoJ's range; the arm lags by about this much
 _BRAKING = 10.0  # rad/s^2 of servoStop; ur-rtde's default
 _UNLOCKING = 2.0  # s that clearing a protective stop may take
+_STOP_REPORTED = 0.1  # s after the control program's end in which a stop is reported
 _WATCHDOG = 10.0  # Hz; with fewer commands the controller stops its program, and so the arm
 
 
@@ -30,7 +31,7 @@ class UrClient(ArmClient):
     def _connect(self, recover: bool) -> JointLimits:
         robot = self.config.robot
         self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
-        self._refused = False
+        self._refused, self._ended = False, ""
         self._receive = UR_RTDE.load("rtde_receive").RTDEReceiveInterface(self.config.address)
         if recover and self._receive.isProtectiveStopped():
             self._unlock()
@@ -87,11 +88,21 @@ class UrClient(ArmClient):
         return ""
 
     def _fault(self) -> str:
-        if self._stopped():
-            return self._stopped()
+        if stopped := self._stopped():
+            return stopped
         if self._refused or not self._control.isProgramRunning():
-            return "the control program ended: look at the pendant's log, then recover the arm"
-        return ""
+            self._ended = self._ended or self._why_ended()
+        return self._ended
+
+    def _why_ended(self) -> str:
+        """Say why the control program ended; a stop is reported some packets later."""
+        end = time.monotonic() + _STOP_REPORTED
+        while not self._stopped() and time.monotonic() < end:
+            time.sleep(self.period)
+        return (
+            self._stopped()
+            or "the control program ended: look at the pendant's log, then recover the arm"
+        )
 
     def _send(self, q: Joints, velocity: Joints) -> None:
         taken = self._control.servoJ(q.tolist(), 0.0, 0.0, self.period, self._lookahead, _GAIN)

@@ -26,6 +26,7 @@ Width = Annotated[float, Field(ge=0, le=0.2)]  # m
 Kelvin = Annotated[int, Field(ge=1000, le=15_000)]
 CameraName = Literal["front", "wrist"]
 SimulatedTask = Literal["pick-place", "bead-maze"]
+"""Tasks of the simulator that `deploy` and `twin` know."""
 UnitComponent = Annotated[float, Field(ge=-1, le=1)]  # of a unit quaternion, wxyz
 CameraPose = tuple[
     Coordinate, Coordinate, Coordinate, UnitComponent, UnitComponent, UnitComponent, UnitComponent

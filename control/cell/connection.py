@@ -6,14 +6,14 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.arms import franka, ur
 from touchgoal.control.arms.streaming import ArmConfig, ArmProcess
-from touchgoal.control.cell.config import CellConfig, FingertipsSection
+from touchgoal.control.cell.config import CameraName, CellConfig, FingertipsSection
 from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.cell.twin_client import LockStepClock, ask_twin
 from touchgoal.control.grippers.franka_hand import FrankaHand, NonBlockingGripper
@@ -131,16 +131,8 @@ def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellC
     robot = cell_limits(cell)
     with ExitStack() as undo:
         cameras: dict[str, Camera] = {}
-        for name, camera in cell.cameras.items():
-            config = VideoConfig(
-                camera.source, camera.size, camera.rate, camera.exposure, camera.white_balance
-            )
-            video = VideoCamera(_timed(config, cell))
-            cameras[ft.IMAGE_PREFIX + name] = undo.enter_context(closing(video))
-        if cell.fingertips:
-            for side, key in enumerate(ft.TACTILE):
-                fingertip = _tactile_camera(cell, cell.fingertips, side)
-                cameras[key] = undo.enter_context(closing(fingertip))
+        for key in camera_formats(cell):
+            cameras[key] = undo.enter_context(closing(connect_camera(cell, key)))
         load_cell = None
         if cell.load_cell:
             load_cell = undo.enter_context(closing(SerialLoadCell(cell.load_cell)))
@@ -158,6 +150,28 @@ def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellC
         undo.pop_all()
     truth = partial(ask_twin, cell.task.twin, "truth") if cell.task.twin else None
     return CellConnection(robot, arm, gripper, cameras, load_cell, clock, truth)
+
+
+def camera_formats(cell: CellConfig) -> dict[str, tuple[float, int, int]]:
+    """Return rate (Hz), height and width (px) of a cell's recorded images by their keys in `features`."""
+    rows, columns, _ = ft.CAMERA_SHAPE
+    formats = {
+        ft.IMAGE_PREFIX + name: (own.rate, rows, columns) for name, own in cell.cameras.items()
+    }
+    if tips := cell.fingertips:
+        model = find_sensor(tips.sensor)
+        tip = tips.rate or model.frame_rate, *model.image_shape
+        formats |= dict.fromkeys(ft.TACTILE, tip)
+    return formats
+
+
+def connect_camera(cell: CellConfig, key: str) -> Camera:
+    """Open a camera or a fingertip of a cell by its key in `features`; UserError if it is missing."""
+    if cell.fingertips and key in ft.TACTILE:
+        return _tactile_camera(cell, cell.fingertips, ft.TACTILE.index(key))
+    own = cell.cameras[cast(CameraName, key.removeprefix(ft.IMAGE_PREFIX))]
+    config = VideoConfig(own.source, own.size, own.rate, own.exposure, own.white_balance)
+    return VideoCamera(_timed(config, cell))
 
 
 def connect_arm(cell: CellConfig, hz: float, recover: bool = False) -> ArmProcess:

@@ -85,7 +85,7 @@ class LockStepClock:
         self._issued = self._answered = 0
         answer = self._ask("hold")
         self._time = self._gripper_due = answer["time"]
-        self._missed = self._missed_pictures(answer["pictures"])
+        self._missed = self._missed_pictures(self._ask("pictures"))
         self._history = deque([(time.monotonic(), self._time)], maxlen=_HISTORY_LENGTH)
 
     def reset(self, seed: int) -> None:

@@ -12,6 +12,7 @@ THRESHOLD = 1.2  # counts; noise of 1 count has a strength of 0.3, at most 0.45
 # Mini (PhysiCLeAR) 2.5 finds every touch; at 2 and below, untouched frames count as touches.
 _SPARE = 2.5
 _LEARNING_FRAMES = 10  # 0.4 s of a 25 Hz sensor
+_FEWEST_FRAMES = 3  # of these that differ
 _LEARNING_QUANTILE = 0.3
 _OVER_NOISE = 1.8  # multiple of the usual noise below which any contact ends
 _LEARNING_THRESHOLD = 5.0  # counts; the strongest compression noise measured had a strength of 2.5
@@ -35,9 +36,11 @@ class ContactDetector:
         self.background = background
         self.threshold = _LEARNING_THRESHOLD if threshold is None else float(threshold)
         self._untouched: list[float] | None = [] if threshold is None else None  # strengths
+        self._seen = 0  # untouched frames while learning, repeats included
         self._noise = 0.0  # usual strength of untouched frames, estimated so far
         self.touching, self.strength = False, 0.0
         self._peak = 0.0  # strength
+        self._latest = np.rint(background.steady).astype(np.uint8)  # frame learned from
 
     def update(self, frame: Picture) -> bool:
         """Process the next frame and return whether it is in contact."""
@@ -52,16 +55,19 @@ class ContactDetector:
         ends_at = np.clip(_RELEASE * self._peak, least, self.threshold)
         self.touching = self.strength > float(ends_at if self.touching else self.threshold)
         if not self.touching:
-            self._learn()
+            self._learn(frame)
             self.background.update(frame)
         return self.touching
 
-    def _learn(self) -> None:
-        """Estimate the sensor's noise from its first untouched frames."""
+    def _learn(self, frame: Picture) -> None:
+        """Estimate the sensor's noise from its first untouched frames, of which repeats show none."""
         if self._untouched is None:
             return
-        self._untouched.append(self.strength)
-        if len(self._untouched) == _LEARNING_FRAMES:
+        self._seen += 1
+        if not np.array_equal(frame, self._latest):
+            self._untouched.append(self.strength)
+        self._latest = frame.copy()
+        if self._seen >= _LEARNING_FRAMES and len(self._untouched) >= _FEWEST_FRAMES:
             # Not the mean: a contact may begin, too weak to detect yet.
             self._noise = float(np.quantile(self._untouched, _LEARNING_QUANTILE))
             self.threshold = max(THRESHOLD, _SPARE * self._noise)

@@ -20,7 +20,7 @@ from touchgoal.encoders.towers.wheels import wheel_folder
 from touchgoal.runtime.errors import UserError
 
 BATCH = 32
-_CPU_PICTURES = 4  # a larger batch of EfficientNet's activations leaves the cache: 30 % slower
+_CPU_PICTURES = 4  # images that a core takes at a time
 _SIDE = 224  # px, shorter side of an image for the ImageNet network
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 T = TypeVar("T")

@@ -4,6 +4,8 @@ An epoch's randomness depends on the seed and the epoch alone, so a resumed trai
 same weights, bit for bit. Several processes share each batch and its noise.
 """
 
+import atexit
+import gc
 import math
 import shlex
 from collections.abc import Callable, Mapping
@@ -16,7 +18,6 @@ from accelerate import Accelerator
 from accelerate.utils import send_to_device
 from jaxtyping import Int, Shaped
 from torch import Tensor, nn
-from torch.distributed._functional_collectives import all_gather_single
 from tqdm import tqdm
 
 from touchgoal.encoders.training import checkpoint
@@ -25,6 +26,11 @@ from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import on_interruption
 from touchgoal.runtime.provenance import command_line
+
+try:
+    from torch.distributed._functional_collectives import all_gather_single
+except ImportError:  # its name in torch 2.11, which lerobot pins
+    from torch.distributed._functional_collectives import all_gather_tensor as all_gather_single
 
 Metrics = dict[str, Any]  # numbers by name; None where one is undefined
 
@@ -294,4 +300,14 @@ def _accelerator(device: str) -> Accelerator:
         raise UserError(
             f"this process has trained on {accelerator.device.type} already: train on {device} in a new one"
         )
+    if accelerator.num_processes > 1:
+        atexit.unregister(_leave_process_group)  # of an earlier training in this process
+        atexit.register(_leave_process_group)
     return accelerator
+
+
+def _leave_process_group() -> None:
+    """Free the wrapped models, then end gloo's threads: left to the exit, they may crash (torch 2.13)."""
+    gc.collect()
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()

@@ -14,14 +14,14 @@ from touchgoal.episodes.recording import EpisodeSpec, run
 from touchgoal.policies.by_name import AnyPolicy, PolicyMaker, prepare_policy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import RefusedError, UserError
 from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, TaskConfig
+from touchgoal.sim_envs.config import ENVS, TaskConfig
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.scene.objects import CATALOGUE
 from touchgoal.sim_envs.tasks import make_env
 
+REFUSED = "refused"  # failure of an episode in which the policy would not act
 _TOLERANCE = 1e-3  # rad or m by which an action may exceed a limit before it counts as clamped
 _LIGHT_TICKS = 10  # from one look at the fingertips' light to the next
 
@@ -34,7 +34,7 @@ class Trial:
         seed: random seed of the episode.
         success: as the task defines it.
         progress: the greatest reached, in [0, 1].
-        failure: what ended it: drop, jam, over_force or time; "" after a success.
+        failure: what ended it, such as drop, over_force, time or refused; "" after a success.
         peak_force: greatest external force on the hand, N.
         mean_force: its mean, N.
         peak_pad_force: greatest normal force on a fingertip, N.
@@ -43,7 +43,7 @@ class Trial:
         seconds: length.
         clamped: share of the ticks whose action was beyond the arm's or the gripper's limits.
         light_change: largest change of a fingertip's light since the first picture, as a share.
-        episode: what distinguishes it: the object, its mass, or the wire.
+        episode: what distinguishes it, such as the object, its mass, or the wire.
     """
 
     seed: int
@@ -94,7 +94,7 @@ def evaluate(
     Args:
         policy: a name or folder as for `--policy`, what `load_policy` returned, or a user's own
             policy (see `control/deployment/user_policy.py`): its class, or an object of it.
-        task: "pick-place", "bead-maze" (validation wires), or the config of either.
+        task: "pick-place", "bead-maze" (validation wires), "fragile-carry", or a config of one.
         episodes: number of episodes; objects are taken in turn, wires one each.
         seed: of the first episode; each further one adds one.
         workers: processes that simulate; with more than one, start from a script that guards its
@@ -115,11 +115,8 @@ def evaluate(
 
 def trial_specs(config: TaskConfig, count: int, seed: int) -> list[EpisodeSpec]:
     """Return `count` episodes: objects in turn, wires one each; seeds count up from `seed`."""
-    if isinstance(config, BeadMazeConfig):
-        wires = config.chosen_wires(count)
-        return [EpisodeSpec(seed + i, options={"wire": w.name}) for i, w in enumerate(wires)]
-    names = config.objects or list(CATALOGUE)
-    return [EpisodeSpec(seed + i, options={"object": names[i % len(names)]}) for i in range(count)]
+    options = config.reset_options(count)
+    return [EpisodeSpec(seed + i, options=options[i % len(options)]) for i in range(count)]
 
 
 def run_trials(
@@ -143,11 +140,15 @@ def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Tri
     try:
         observation, info = env.reset(seed=spec.seed, options=spec.options)
         keys = (ft.WRENCH, ft.TRUTH_PAD_WRENCH, ft.TRUTH_PROGRESS, ft.ACTION)
-        rows, last, light = [], info, LightWatch()
-        for last in run(env, policy(env), observation, info):
-            if len(rows) % _LIGHT_TICKS == 0:
-                light.update(last)
-            rows.append([last[key] for key in keys])  # images would fill the memory
+        rows, light, failed = [], LightWatch(), []
+        last = {**observation, ft.ACTION: np.zeros(env.action_space.shape or ()), **info}
+        try:
+            for last in run(env, policy(env), observation, info):
+                if len(rows) % _LIGHT_TICKS == 0:
+                    light.update(last)
+                rows.append([last[key] for key in keys])  # images would fill the memory
+        except RefusedError:
+            rows, failed = [*rows, [last[key] for key in keys]], [REFUSED]
         wrench, pads, progress, actions = (np.stack(column) for column in zip(*rows, strict=True))
         force = np.linalg.norm(wrench[:, :3], axis=1)
         goal = env.goal if isinstance(env, PickPlace) else None
@@ -158,13 +159,14 @@ def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Tri
             seed=spec.seed,
             success=bool(last[ft.TRUTH_SUCCESS][0]),
             progress=float(progress.max()),
-            failure="" if last[ft.TRUTH_SUCCESS][0] else (env.failures() or ["time"])[0],
+            failure="" if last[ft.TRUTH_SUCCESS][0] else [*failed, *env.failures(), "time"][0],
             peak_force=float(force.max()),
             mean_force=float(force.mean()),
             peak_pad_force=float(np.abs(pads[:, [2, 8]]).max()),
             goal_distance=None if away is None else float(away),
             seconds=(len(rows) - 1) / config.control_hz,
-            clamped=float(np.any((actions < low) | (actions > high), axis=1)[:-1].mean()),
+            clamped=float(np.any((actions < low) | (actions > high), axis=1)[:-1].sum())
+            / max(len(rows) - 1, 1),
             light_change=light.change,
             episode=env.episode_info(),
         )
@@ -175,6 +177,6 @@ def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Tri
 def _task_config(task: str | TaskConfig) -> TaskConfig:
     if not isinstance(task, str):
         return task
-    if task not in TASKS:
-        raise UserError(f"there is no task {task!r}: choose from {', '.join(TASKS)}")
-    return BeadMazeConfig(split="validation") if task == "bead-maze" else TASKS[task]()
+    if task not in ENVS:
+        raise UserError(f"there is no task {task!r}: choose from {', '.join(ENVS)}")
+    return ENVS[task]

@@ -2,18 +2,25 @@
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from touchgoal.control import features as ft
+from touchgoal.control.tick_parts import parts_of
 from touchgoal.episodes.film import write_film
-from touchgoal.episodes.recording import EpisodeSpec, record_with_film
+from touchgoal.episodes.recording import EpisodeSpec, OnTick, record_with_film
 from touchgoal.policies.by_name import PolicyMaker
-from touchgoal.policies.evaluation.evaluate import Evaluation, Trial
+from touchgoal.policies.evaluation.evaluate import REFUSED, Evaluation, Trial
 from touchgoal.policies.evaluation.table import table, worst_first
 from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.parallel.parallel_map import parallel_map
+from touchgoal.runtime.viewer.stream import RerunStream, open_rerun
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.tasks import make_env
 
@@ -47,30 +54,72 @@ def record_trials(out: Path, trials: Iterator[Trial], count: int) -> list[Trial]
 
 
 def film_trials(
-    out: Path,
+    out: Path | None,
     task: TaskConfig,
     specs: Sequence[EpisodeSpec],
     trials: Sequence[Trial],
     policy: PolicyMaker,
     workers: int,
+    rerun: str | None = None,
 ) -> None:
-    """Run the worst, the median and the best episode again, and film them side by side."""
-    ranked = [specs[i] for i in worst_first(trials)]
+    """Run the worst, the median and the best episode again, film them and show them in rerun.
+
+    Args:
+        out: folder of the films; None for none.
+        rerun: target of `open_rerun`, which shows the episodes as they run, one after another; None
+            for none.
+    """
+    jobs = list(_chosen(specs, trials).items())
+    film = partial(_film, task, policy, out)
+    with ExitStack() as opened:
+        if rerun is None:
+            filmed = opened.enter_context(parallel_map(film, jobs, workers))
+        else:
+            stream = opened.enter_context(open_rerun(rerun))
+            filmed = map(film, jobs, (_shown_in(stream, name, task.control_hz) for name, _ in jobs))
+        for (name, spec), path in zip(jobs, filmed, strict=True):
+            print(f"{name} episode (seed {spec.seed}): {path or rerun}")
+
+
+def _chosen(specs: Sequence[EpisodeSpec], trials: Sequence[Trial]) -> dict[str, EpisodeSpec]:
+    """Return worst, best and median episode, as far as there are as many."""
+    ranked = [specs[i] for i in worst_first(trials) if trials[i].failure != REFUSED]
+    if not ranked:
+        return {}
     chosen = {"worst": ranked[0], "best": ranked[-1], "median": ranked[len(ranked) // 2]}
-    names = list(chosen)[: len(ranked)]
-    paths = [out / f"{name}.mp4" for name in names]
-    jobs = [(chosen[name], path) for name, path in zip(names, paths, strict=True)]
-    with parallel_map(partial(_film, task, policy), jobs, workers) as filmed:
-        for name, path, _ in zip(names, paths, filmed, strict=True):
-            print(f"{name} episode (seed {chosen[name].seed}): {path}")
+    return dict(list(chosen.items())[: len(ranked)])
 
 
-def _film(task: TaskConfig, policy: PolicyMaker, job: tuple[EpisodeSpec, Path]) -> None:
-    spec, path = job
+def _film(
+    task: TaskConfig,
+    policy: PolicyMaker,
+    out: Path | None,
+    job: tuple[str, EpisodeSpec],
+    on_tick: OnTick | None = None,
+) -> Path | None:
+    name, spec = job
     env = make_env(task)  # with the same images, because rendering them draws random numbers
-    episode, images = record_with_film(env, spec, policy, meshes="fast")
-    write_film(path, images, episode, task.control_hz)
+    episode, pictures = record_with_film(env, spec, policy, "fast", on_tick)
     env.close()
+    if out is None:
+        return None
+    path = out / f"{name}.mp4"
+    write_film(path, pictures, episode, task.control_hz)
+    return path
+
+
+def _shown_in(stream: RerunStream, name: str, hz: int) -> OnTick:
+    """Return what logs each tick; where the front camera is not rendered, the film's scene is."""
+    frames = count()
+
+    def show(tick: dict[str, np.ndarray], picture: np.ndarray) -> None:
+        images, scalars = parts_of(tick, name)
+        if ft.FRONT not in tick:
+            images = {f"{name}/scene": picture[:, : len(picture)], **images}
+        frame = next(frames)
+        stream.log(frame, frame / hz, images, scalars)
+
+    return show
 
 
 def _summary(trials: list[Trial]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -10,17 +11,28 @@ from jaxtyping import Float, Float32, Int64, UInt8
 from torch import Tensor
 
 from touchgoal.control import features as ft
+from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.policies.perception.target_words import COLOURS, Look, sentence
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import PickPlaceConfig
-from touchgoal.sim_envs.pick_place import PickPlace
+from touchgoal.sim_envs.pick_place import WORKSPACE, Hand, PickPlace
 from touchgoal.sim_envs.surroundings import USUAL, UsualScene, draw_surroundings
 
 MOST = 4  # objects on the table
 _ALONE = 0.4  # share of the placements with one object
-_USUAL = 0.3  # share of the placements with camera and light as they usually are
+_BESIDE, _OVER, _ANYWHERE = 0.06, (0.05, 0.2), (0.06, 0.34)  # m, of a hand and its TCP's height
 _COLOUR_NOISE = 0.04  # standard deviation of a painted colour, of [0, 1]
+
+
+@dataclass(frozen=True)
+class Variety:
+    """Shares of the placements, or of the objects, that are not as usual."""
+
+    painted: float = 0.5  # objects of another colour than their kind's
+    surroundings: float = 0.7  # placements with another camera pose and light
+    hand_anywhere: float = 0.2  # placements with the hand anywhere over the table
+    hand_over: float = 0.3  # placements with it over an object, as when an episode looks again
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,24 +61,29 @@ def render_placements(
     placements_each: int,
     seed: int,
     workers: int,
-    painted: float = 0.5,
-    usual: float = _USUAL,
+    variety: Variety = Variety(),
 ) -> Placements:
     """Render scenes of objects of random shape and size, each at several places.
 
-    Seeds count up from `seed`. The share `painted` of the objects has another colour than its kind;
-    the share `usual` of the placements has camera and light as they usually are.
+    Seeds count up from `seed`.
     """
     config = replace(config, distractors=MOST - 1)
     seeds = range(seed, seed + scenes)
-    render = partial(_render_scene, config, placements_each, painted, usual)
-    with parallel_map(render, seeds, workers) as rendered:
-        rows = [row for some in track(rendered, "rendering", "scene", total=scenes) for row in some]
+    keys = [ft.IMAGE_PREFIX + camera for camera in config.cameras]
+    shape = scenes * placements_each, *config.camera_size, 3
+    pictures = {key: torch.empty(shape, dtype=torch.uint8) for key in keys}
+    rows: list[dict[str, Any]] = []
+    with parallel_map(
+        partial(_render_scene, config, placements_each, variety), seeds, workers
+    ) as some:
+        for row in chain.from_iterable(track(some, "rendering", "scene", total=scenes)):
+            for key in keys:  # nothing else is large: one copy of these must do
+                pictures[key][len(rows)] = torch.from_numpy(row.pop(key))
+            rows.append(row)
     sentences = sorted({words for row in rows for words in row["words"] if words})
     number = {words: i for i, words in enumerate(sentences)} | {None: -1}
-    keys = [key for key in ft.CAMERAS if key in rows[0]]
     return Placements(
-        pictures={key: _column(rows, key) for key in keys},
+        pictures=pictures,
         tcp=_column(rows, ft.TCP_POSE),
         start=_column(rows, "start"),
         pixels={key: _column(rows, f"pixels.{key}") for key in keys},
@@ -81,28 +98,28 @@ def _column(rows: list[dict[str, Any]], key: str) -> Tensor:
 
 
 def _render_scene(
-    config: PickPlaceConfig, placements_each: int, painted: float, usual: float, seed: int
+    config: PickPlaceConfig, placements_each: int, variety: Variety, seed: int
 ) -> list[dict[str, Any]]:
     env = PickPlace(config)
     env.reset(seed=seed)
     rng = env.np_random.spawn(1)[0]
     scene, rows = UsualScene.of(env.model), []
     for _ in range(placements_each):
-        changed = rng.random() > usual
+        changed = rng.random() < variety.surroundings
         scene.change(env.model, draw_surroundings(rng) if changed else USUAL)
-        rows.append(_render_placement(env, rng, painted))
+        rows.append(_render_placement(env, rng, variety))
     env.close()
     return rows
 
 
-def _render_placement(env: PickPlace, rng: np.random.Generator, painted: float) -> dict[str, Any]:
+def _render_placement(env: PickPlace, rng: np.random.Generator, variety: Variety) -> dict[str, Any]:
     """Paint some objects, hide others, move all of them, and render them."""
     count = 1 if rng.random() < _ALONE else int(rng.integers(2, MOST + 1))
     order = rng.permutation(MOST)
     shown = [env.bodies[i] for i in order[:count]]
     looks = []
     for body in env.bodies:
-        rgb, paint = np.array(body.kind.material.rgba[:3]), bool(rng.random() < painted)
+        rgb, paint = np.array(body.kind.material.rgba[:3]), bool(rng.random() < variety.painted)
         if paint:
             name = list(COLOURS)[rng.integers(len(COLOURS))]
             rgb = np.clip(rng.normal(COLOURS[name], _COLOUR_NOISE), 0, 1)
@@ -110,7 +127,7 @@ def _render_placement(env: PickPlace, rng: np.random.Generator, painted: float) 
         if body in shown:
             looks.append(Look(body.kind, rgb, paint))
     shown.sort(key=env.bodies.index)
-    observation, _ = env.rearrange()
+    observation, _ = env.rearrange(_draw_hand(env, rng, order[:count], variety))
     row: dict[str, Any] = dict(observation)
     starts = np.stack([env.start_of(body.name) for body in shown])
     row["start"], row["objects"] = _padded(starts), count
@@ -122,6 +139,23 @@ def _render_placement(env: PickPlace, rng: np.random.Generator, painted: float) 
     words = [sentence(rng, look, [*looks[:i], *looks[i + 1 :]]) for i, look in enumerate(looks)]
     row["words"] = [*words, *[None] * (MOST - count)]
     return row
+
+
+def _draw_hand(
+    env: PickPlace, rng: np.random.Generator, shown: Int64[np.ndarray, " s"], variety: Variety
+) -> Hand | None:
+    """Draw where the hand is; None: where it usually starts."""
+    kind, turn = rng.random(), rng.uniform(-np.pi / 2, np.pi / 2)
+
+    def joints(objects: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " j"]:
+        at, heights = rng.uniform(*np.array(WORKSPACE).T), _ANYWHERE
+        if kind < variety.hand_over:
+            at = objects[rng.choice(shown)] + rng.uniform(-_BESIDE, _BESIDE, 2)
+            heights = _OVER
+        position = np.append(at, rng.uniform(*heights))
+        return env.kinematics.solve_ik(position, fingers_down(turn), env.robot.arm.home)
+
+    return joints if kind < variety.hand_over + variety.hand_anywhere else None
 
 
 def _padded(rows: Float[np.ndarray, "m d"]) -> Float32[np.ndarray, "k d"]:

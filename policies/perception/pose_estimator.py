@@ -4,7 +4,7 @@ It looks twice: a coarse map scores where the named object and the goal are; a c
 full resolution, gives their poses. Keypoints of the whole image show how the camera stands.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import cast
 
 import torch
@@ -31,6 +31,21 @@ _BRIGHTNESS, _MOST_GAIN = 110.0, 6.0  # grey levels of 255, the mean of the usua
 Pictures = dict[str, UInt8[Tensor, "b h w 3"]]
 Places = dict[str, Float[Tensor, "b 2 2"]]
 """Row and column (px) of the object and of the goal in each camera image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """Estimate from images, with its confidence."""
+
+    start: Float[Tensor, "b 7"]  # `features.TRUTH_START`
+    found: Float[Tensor, "b 2"]  # share of the scores near the object and near the goal, in [0, 1]
+    # Length of (cos, sin) of twice the yaw: 1 if sure, less where two yaws are as likely.
+    turned: Float[Tensor, " b"]
+
+    @property
+    def sureness(self) -> tuple[float, float, float]:
+        """How sure the network is of the first image: see `PoseEstimatorConfig.sure`."""
+        return (*self.found[0].tolist(), float(self.turned[0]))
 
 
 class PoseEstimator(nn.Module):
@@ -63,10 +78,26 @@ class PoseEstimator(nn.Module):
 
         `words` are `target_words.embed`; zeros without a sentence, where one object is there.
         """
-        pictures = evenly_lit(pictures)
-        scores = self.scores(pictures, words)
-        places = {key: _find(scores[key], box) for key, box in self.config.crops}
-        return self.start_normalizer.inverse(self.scaled(pictures, tcp, places))
+        lit = evenly_lit(pictures)
+        return self.look(lit, words, self.scene(lit, tcp)).start
+
+    def scene(self, lit: Pictures, tcp: Float[Tensor, "b 7"]) -> Float[Tensor, "b s"]:
+        """Return how the camera stands, by the whole image and the hand in it."""
+        known = [self.tcp_normalizer(tcp)]
+        for (key, _), scene in zip(self.config.crops, self.scenes, strict=True):
+            halved = lit[key][:, ::2, ::2]
+            middle = torch.tensor(halved.shape[1:3], device=tcp.device) / 2
+            known.append(scene(halved, middle.expand(len(halved), -1)))
+        return torch.cat(known, 1)
+
+    def look(self, lit: Pictures, words: Float[Tensor, "b d"], scene: Float[Tensor, "b s"]) -> Look:
+        """Find object and goal in evenly lit images; `scene` may be of the episode's first images."""
+        scores = self.scores(lit, words)
+        found = {key: _find(scores[key], box) for key, box in self.config.crops}
+        places = {key: place for key, (place, _) in found.items()}
+        start = self.start_normalizer.inverse(self.scaled(lit, scene, places))
+        surest = torch.stack([share for _, share in found.values()]).amax(0)
+        return Look(start, surest, start[:, 3:5].norm(dim=1))
 
     def scores(
         self, pictures: Pictures, words: Float[Tensor, "b d"]
@@ -82,17 +113,12 @@ class PoseEstimator(nn.Module):
         return {key: _shares(places[key], box) for key, box in self.config.crops}
 
     def scaled(
-        self, pictures: Pictures, tcp: Float[Tensor, "b 7"], places: Places
+        self, pictures: Pictures, scene: Float[Tensor, "b s"], places: Places
     ) -> Float[Tensor, "b 7"]:
         """Return the estimate from crops around these places, normalised to variance 1."""
-        known = [self.tcp_normalizer(tcp)]
-        for (key, _), scene in zip(self.config.crops, self.scenes, strict=True):
-            halved = pictures[key][:, ::2, ::2]
-            middle = torch.tensor(halved.shape[1:3], device=tcp.device) / 2
-            known.append(scene(halved, middle.expand(len(halved), -1)))
         estimate = []
         for part, head in enumerate(self.heads):
-            found = list(known)
+            found = [scene]
             for (key, _), looks in zip(self.config.crops, self.looks, strict=True):
                 look = cast(nn.ModuleList, looks)[part]
                 found.append(look(pictures[key], places[key][:, part]))
@@ -106,7 +132,9 @@ def evenly_lit(pictures: Pictures) -> Pictures:
     for key, some in pictures.items():
         mean = some[:, ::4, ::4].float().mean((1, 2, 3), keepdim=True)
         gain = (_BRIGHTNESS / mean).clamp(0.5, _MOST_GAIN)
-        lit[key] = (some * gain).clamp(max=255).to(torch.uint8)
+        # One at a time, which stays in the processor's cache.
+        rows = [(p * g).clamp_(max=255).to(torch.uint8) for p, g in zip(some, gain, strict=True)]
+        lit[key] = torch.stack(rows)
     return lit
 
 
@@ -172,13 +200,17 @@ def _shares(places: Float[Tensor, "b 2 2"], box: Box) -> Float[Tensor, "b 2 y x"
     return (-far / 2).flatten(2).softmax(2).view_as(far)
 
 
-def _find(scores: Float[Tensor, "b 2 y x"], box: Box) -> Float[Tensor, "b 2 2"]:
-    """Return the places (px): the mean over the cells around the highest score."""
+def _find(
+    scores: Float[Tensor, "b 2 y x"], box: Box
+) -> tuple[Float[Tensor, "b 2 2"], Float[Tensor, "b 2"]]:
+    """Return the places (px), the mean over the cells around the highest score, and their share."""
     centres = _centres(box).to(scores).flatten(0, 1)
-    peak = centres[scores.flatten(2).argmax(2)]
+    scores = scores.flatten(2)
+    peak = centres[scores.argmax(2)]
     near = (peak[:, :, None] - centres).norm(dim=-1) <= _PEAK * _CELL
-    share = scores.flatten(2).masked_fill(~near, -torch.inf).softmax(2)
-    return share @ centres
+    share = scores.softmax(2)
+    place = scores.masked_fill(~near, -torch.inf).softmax(2) @ centres
+    return place, share.masked_fill(~near, 0).sum(2)
 
 
 class _SpatialSoftmax(nn.Module):

@@ -1,5 +1,6 @@
 """Training of the pose estimator on rendered placements."""
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.policies.config import Box, PoseTrainConfig
 from touchgoal.policies.perception.placements import Placements
-from touchgoal.policies.perception.pose_estimator import PoseEstimator, evenly_lit
+from touchgoal.policies.perception.pose_estimator import Look, PoseEstimator, evenly_lit
 from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
 
 _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose counts linearly
@@ -23,6 +24,7 @@ _FINDER_ROWS = 4  # the first look, which learns faster, is trained on one of so
 _WORD_NOISE = 0.015  # standard deviation of each number of a sentence's embedding of length 1
 _PLACE_NOISE = 8.0  # px by which crops are off in training: a cell of the first look
 _BATCH = 64
+_BAD, _FALSE_REFUSALS = (0.02, 20.0), 0.02  # m and degrees by which an estimate is off; share
 
 
 def train_pose_estimator(
@@ -35,7 +37,9 @@ def train_pose_estimator(
 ) -> None:
     """Train the pose estimator; writes what `trainer.fit` does."""
     there = torch.arange(placements.start.shape[1]) < placements.objects[:, None]
-    estimator.tcp_normalizer.fit_mean_std(placements.tcp)
+    # Rounded: what inverse kinematics leaves of the hand's tilt is no information, and would be taken
+    # for some when a real hand is tilted by a thousandth.
+    estimator.tcp_normalizer.fit_mean_std(placements.tcp.round(decimals=4))
     estimator.start_normalizer.fit_mean_std(placements.start[there])
     embedded = embed(placements.sentences) if placements.sentences else torch.empty(0, WORDS_WIDTH)
 
@@ -94,7 +98,8 @@ class _PoseLoss(nn.Module):
         off: Tensor,
     ) -> dict[str, Tensor]:
         near = {key: place + off for key, place in places.items()}
-        predicted = self.estimator.scaled(pictures, tcp, near)
+        scene = self.estimator.scene(pictures, tcp)
+        predicted = self.estimator.scaled(pictures, scene, near)
         target = self.estimator.start_normalizer(start)
         pose = F.smooth_l1_loss(predicted, target, beta=_HUBER_BETA)
         few = slice(None, None, _FINDER_ROWS)  # the same rows in one process and in several
@@ -162,6 +167,31 @@ def _add_pixel_noise(
 
 
 @torch.no_grad()
+def fit_sure(
+    estimator: PoseEstimator, placements: Placements
+) -> tuple[tuple[float, float, float], dict[str, float]]:
+    """Return `PoseEstimatorConfig.sure`, and the shares of good and of bad estimates refused by it.
+
+    Each number refuses a third of the 2 % of good estimates that may be refused; a bad one is off by
+    2 cm or 20 degrees. Only what sentences single out is looked at, or stands alone.
+    """
+    sure, good = [], []
+    for rows, target, words in _targets(placements):
+        found, true = _look(estimator, placements, rows, words), placements.start[rows, target]
+        sure.append(torch.cat([found.found, found.turned[:, None]], 1))
+        off = (found.start - true)[:, :2].norm(dim=1)
+        good.append((off < _BAD[0]) & (_yaw_error(found.start, true) < _BAD[1]))
+    shares, fine = torch.cat(sure), torch.cat(good)
+    if not fine.any():  # without a good estimate there is no threshold
+        return (0.0, 0.0, 0.0), {"good": 0.0, "bad": 0.0}
+    least = shares[fine].quantile(_FALSE_REFUSALS / shares.shape[1], dim=0)
+    refused = (shares < least).any(1).float()
+    known = {"good": refused[fine].mean().item(), "bad": refused[~fine].sum().item()}
+    known["bad"] /= max(int((~fine).sum()), 1)
+    return (*least.tolist(),), known  # pyright: ignore[reportReturnType]
+
+
+@torch.no_grad()
 def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, dict[str, Any]]:
     """Return the errors by number of other objects; alone, without a sentence.
 
@@ -170,6 +200,19 @@ def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, d
     (mm), and of the grasp's yaw (degrees) for objects that are not round.
     """
     errors = {}
+    for rows, target, words in _targets(placements):
+        others = int(placements.objects[rows[0]]) - 1
+        errors[f"{others} others"] = _errors(estimator, placements, rows, target, words)
+    return errors
+
+
+def _targets(
+    placements: Placements,
+) -> Iterator[tuple[Int64[Tensor, " n"], Int64[Tensor, " n"], Float[Tensor, "n d"]]]:
+    """Yield rows, target of each, and its embedded sentence, by number of other objects.
+
+    Where it is alone there is none.
+    """
     for others in range(placements.start.shape[1]):
         named = placements.sentence >= 0
         if others == 0:
@@ -181,8 +224,26 @@ def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, d
             if others:
                 sentences = placements.sentence[rows, target]
                 words = embed([placements.sentences[i] for i in sentences])
-            errors[f"{others} others"] = _errors(estimator, placements, rows, target, words)
-    return errors
+            yield rows, target, words
+
+
+def _look(
+    estimator: PoseEstimator,
+    placements: Placements,
+    rows: Int64[Tensor, " n"],
+    words: Float[Tensor, "n d"],
+) -> Look:
+    looks = []
+    for some, chosen in zip(rows.split(_BATCH), words.split(_BATCH), strict=True):
+        lit = evenly_lit({key: pictures[some] for key, pictures in placements.pictures.items()})
+        looks.append(estimator.look(lit, chosen, estimator.scene(lit, placements.tcp[some])))
+    return Look(*(torch.cat([getattr(o, k) for o in looks]) for k in ("start", "found", "turned")))
+
+
+def _yaw_error(predicted: Float[Tensor, "n 7"], true: Float[Tensor, "n 7"]) -> Float[Tensor, " n"]:
+    """Return the errors of the grasp's yaw, degrees."""
+    twice = torch.atan2(predicted[:, 4], predicted[:, 3]) - torch.atan2(true[:, 4], true[:, 3])
+    return torch.rad2deg(torch.atan2(twice.sin(), twice.cos()) / 2).abs()
 
 
 def _errors(
@@ -192,26 +253,18 @@ def _errors(
     target: Int64[Tensor, " n"],
     words: Float[Tensor, "n d"],
 ) -> dict[str, Any]:
-    predicted = torch.cat(
-        [
-            estimator(
-                {key: pictures[some] for key, pictures in placements.pictures.items()},
-                placements.tcp[some],
-                chosen,
-            )
-            for some, chosen in zip(rows.split(_BATCH), words.split(_BATCH), strict=True)
-        ]
+    predicted, true = (
+        _look(estimator, placements, rows, words).start,
+        placements.start[rows, target],
     )
-    true = placements.start[rows, target]
     off = predicted - true
-    twice = torch.atan2(predicted[:, 4], predicted[:, 3]) - torch.atan2(true[:, 4], true[:, 3])
-    yaw = torch.rad2deg(torch.atan2(twice.sin(), twice.cos()) / 2).abs()
     away = 1e3 * off[:, :2].norm(dim=1)
     errors = {
         "object_mm": away,
         "goal_mm": 1e3 * off[:, 5:].norm(dim=1),
         "height_mm": 1e3 * off[:, 2].abs(),
-        "yaw_degrees": yaw[true[:, 4] != 0],  # round objects are grasped at 0 exactly
+        # round objects are grasped at 0 exactly
+        "yaw_degrees": _yaw_error(predicted, true)[true[:, 4] != 0],
     }
     at = torch.tensor([0.5, 0.9])
     found = {"count": len(rows), "found": (away < 30).float().mean().item()}

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 from torch import Tensor
 
 from touchgoal.control import features as ft
@@ -17,19 +17,26 @@ from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.config import PoseEstimatorConfig
-from touchgoal.policies.perception.pose_estimator import PoseEstimator
+from touchgoal.policies.perception.pose_estimator import Pictures, PoseEstimator, evenly_lit
 from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import RefusedError, UserError
 
 ESTIMATOR_FORMAT = WeightsFormat(
     "estimator", "pose estimator", "train one with: touchgoal train-pose-estimator"
 )
 _FARTHEST = 4.0  # standard deviations of the hand's start in training
+_OBJECT = 5  # numbers of `features.TRUTH_START` on the object
+_ASKED = ("where the object is", "where the disc is", "how the object is turned")
+# Of looks after the first, m: two that agree within the first distance and are the second one away
+# from what is known say that the object was moved. A hand nearer than the third hides too much.
+_AGREE, _MOVED, _NEAREST = 0.006, 0.014, 0.04
 ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 
 
 class StateEstimator:
     """Estimator of the columns `ESTIMATED`; it follows one episode after the other.
+
+    Until the first touch it looks again at every tick, and follows an object that was moved.
 
     Attributes:
         cameras: columns of the camera images that it reads.
@@ -42,9 +49,12 @@ class StateEstimator:
         self.pose_estimator, self.target = pose_estimator, target
         self.camera_size = pose_estimator.config.size
         self.cameras = tuple(key for key, _ in pose_estimator.config.crops)
+        self._words = embed([target]) if target else torch.zeros(1, WORDS_WIDTH)
         self._first: Mapping[str, np.ndarray] | None = None
-        self._start = np.empty(0, np.float32)
+        self._scene = torch.empty(1, 0)
+        self._start = self._latest = np.empty(0, np.float32)
         self._contact: dict[str, ContactDetector] = {}
+        self._touched, self._least = False, pose_estimator.config.sure
 
     def estimate(
         self, observation: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]
@@ -52,23 +62,49 @@ class StateEstimator:
         """Return the contact of each pad (1 or 0), and the poses at the start.
 
         Observations come in order. An episode's first one is untouched and has all of the table in
-        view.
+        view. RefusedError: it does not show object and goal well enough.
         """
         if self._first is not first:
             self._begin(first)
         contact = [detector.update(observation[key]) for key, detector in self._contact.items()]
+        self._touched |= any(contact)
+        away = np.linalg.norm(observation[ft.TCP_POSE][:3] - self._start[:3])
+        if not self._touched and observation is not first and away > _NEAREST:
+            self._look_again(observation)
         return {ft.TRUTH_CONTACT: np.array(contact, np.float32), ft.TRUTH_START: self._start}
 
     @torch.inference_mode()
     def _begin(self, first: Mapping[str, np.ndarray]) -> None:
         """Begin an episode: estimate its poses, take its untouched gels."""
-        pictures = {key: self._picture(key, first[key]) for key in self.cameras}
         tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
         self._check_hand(tcp)
-        words = embed([self.target]) if self.target else torch.zeros(1, WORDS_WIDTH)
-        self._start = self.pose_estimator(pictures, tcp, words)[0].numpy()
+        pictures = self._pictures(first)
+        self._scene = self.pose_estimator.scene(pictures, tcp)
+        look = self.pose_estimator.look(pictures, self._words, self._scene)
+        for what, sure, least in zip(_ASKED, look.sureness, self._least, strict=True):
+            if sure < least:
+                raise RefusedError(
+                    f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): put "
+                    "objects and disc in view, and say which one is meant (--target)"
+                )
+        self._start = self._latest = look.start[0].numpy()
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
-        self._first = first
+        self._first, self._touched = first, False
+
+    @torch.inference_mode()
+    def _look_again(self, observation: Mapping[str, np.ndarray]) -> None:
+        """Replace the object's pose if two looks agree that it moved.
+
+        How the camera stands is known from the first images, in which nothing moves.
+        """
+        look = self.pose_estimator.look(self._pictures(observation), self._words, self._scene)
+        if any(sure < least for sure, least in zip(look.sureness, self._least, strict=True)):
+            return
+        now, before = look.start[0].numpy(), self._latest
+        self._latest = now
+        moved = np.linalg.norm(now[:2] - self._start[:2]) > _MOVED
+        if moved and np.linalg.norm(now[:2] - before[:2]) < _AGREE:
+            self._start = np.concatenate([(now + before)[:_OBJECT] / 2, self._start[_OBJECT:]])
 
     def _check_hand(self, tcp: Float32[Tensor, "1 7"]) -> None:
         """Refuse a start from where the hand was not in training: it would pass for a moved camera."""
@@ -81,15 +117,19 @@ class StateEstimator:
                 "estimator was trained: move it there (task.start of a cell file)"
             )
 
-    def _picture(self, key: str, picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[Tensor, "1 h w 3"]:
-        size = self.camera_size
-        if picture.shape[:2] != size:
-            given, wanted = (f"{rows} x {columns}" for rows, columns in (picture.shape[:2], size))
-            raise UserError(
-                f"{key} is {given}, the policy was trained on {wanted}: make the environment with "
-                "load_policy(...).env_config(), or set camera_size"
-            )
-        return torch.from_numpy(picture)[None]
+    def _pictures(self, observation: Mapping[str, np.ndarray]) -> Pictures:
+        """Return the evenly lit images of an observation."""
+        pictures = {}
+        for key in self.cameras:
+            picture, size = observation[key], self.camera_size
+            if picture.shape[:2] != size:
+                given, wanted = (f"{y} x {x}" for y, x in (picture.shape[:2], size))
+                raise UserError(
+                    f"{key} is {given}, the policy was trained on {wanted}: make the environment "
+                    "with load_policy(...).env_config(), or set camera_size"
+                )
+            pictures[key] = torch.from_numpy(picture)[None]
+        return evenly_lit(pictures)
 
 
 def load_pose_estimator(directory: Path) -> PoseEstimator:
@@ -101,6 +141,6 @@ def load_pose_estimator(directory: Path) -> PoseEstimator:
 
 def _config(fields: dict[str, Any]) -> PoseEstimatorConfig:
     fields["crops"] = tuple((key, tuple(box)) for key, box in fields["crops"])
-    for name in ("size", "dilations"):
+    for name in ("size", "dilations", "sure"):
         fields[name] = tuple(fields[name])
     return PoseEstimatorConfig(**fields)

@@ -13,7 +13,7 @@ from touchgoal.policies.by_name import choose_policy, env_config_for
 from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig
+from touchgoal.sim_envs.config import PickPlaceConfig, TaskConfig
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tasks import make_expert
@@ -48,8 +48,8 @@ def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> Dagger
 
     UserError: the policy or the expert cannot act in the task.
     """
-    if feedback and isinstance(task, BeadMazeConfig):
-        raise UserError("--feedback is for pick-place: the bead maze's expert always has feedback")
+    if feedback and not isinstance(task, PickPlaceConfig):
+        raise UserError("--feedback is for pick-place: the other experts always have feedback")
     if isinstance(task, PickPlaceConfig) and task.release:
         raise UserError("--env.release needs the planned expert: leave out --feedback and --policy")
     if policy is None or policy == "expert":

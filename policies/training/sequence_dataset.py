@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 
 from touchgoal.control import features as ft
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.policies.network import ObservationBatch, PolicyConfig
@@ -140,8 +141,15 @@ class SequenceDataset:
     executed.
     """
 
-    def __init__(self, recorded: Recordings, config: PolicyConfig) -> None:
+    def __init__(
+        self,
+        recorded: Recordings,
+        config: PolicyConfig,
+        weights: Float32[np.ndarray, " n"] | None = None,
+    ) -> None:
+        """Cut the windows; `weights` say how often each is drawn, relative to the others."""
         self.recorded = recorded
+        self.weights = None if weights is None else torch.from_numpy(weights)
         ends = np.cumsum(recorded.lengths)
         first = np.repeat(ends - recorded.lengths, recorded.lengths)[:, None]
         last = np.repeat(ends - 1, recorded.lengths)[:, None]
@@ -164,6 +172,13 @@ class SequenceDataset:
     def actions(self) -> Float[Tensor, "n h 8"]:
         """Actions of every window; after the end of an episode the last recorded one."""
         return self.recorded.actions[self._planned]
+
+    def draw(self, rows: Int[Tensor, " b"], noise: BatchNoise) -> Int[Tensor, " b"]:
+        """Return these windows or, if windows have weights, as many drawn by them."""
+        if self.weights is None:
+            return rows
+        shares = self.weights.double().cumsum(0)
+        return torch.searchsorted(shares, noise.rand((len(rows),)) * shares[-1], right=True)
 
     def take(self, rows: Int[Tensor, " b"]) -> tuple[ObservationBatch, Float[Tensor, "b h 8"]]:
         """Return observations and actions of some windows."""

@@ -70,7 +70,9 @@ def train(
     training = Training(
         loss=_PolicyLoss(network),
         n_samples=len(windows),
-        batch=lambda rows, noise: _make_batch(windows, rows) | {"noise": noise},
+        batch=lambda rows, noise: (
+            _make_batch(windows, windows.draw(rows, noise)) | {"noise": noise}
+        ),
         optimizer=OptimizerConfig(
             config.epochs,
             config.batch_size,
@@ -163,7 +165,7 @@ def _checksum(windows: SequenceDataset) -> str:
     recorded = windows.recorded
     return checksum(
         recorded.touch, recorded.state, recorded.actions, recorded.pictures, recorded.wrench,
-        recorded.maps, map(str, recorded.lengths),
+        recorded.maps, map(str, recorded.lengths), windows.weights,
     )  # fmt: skip
 
 

@@ -35,13 +35,16 @@ class ChosenEpisodes:
         return f"{len(self.rows)} episodes" + (f" ({', '.join(left)} left out)" if left else "")
 
 
-def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> ChosenEpisodes:
+def choose_episodes(
+    episodes: EpisodeSet, include_unknown: bool = False, include_failed: bool = False
+) -> ChosenEpisodes:
     """Return the episodes that succeeded, and those in which an expert corrected a policy.
 
     `include_unknown` also takes those that do not say whether they succeeded, such as recordings of
-    an arm. Faulty ones are left out and listed. UserError: none is left.
+    an arm, `include_failed` those that failed. Faulty ones are left out and listed. UserError: none
+    is left.
     """
-    known = [succeeded(episodes.meta(i)) for i in range(len(episodes))]
+    known = [include_failed or succeeded(episodes.meta(i)) for i in range(len(episodes))]
     rows = [i for i, good in enumerate(known) if good or (good is None and include_unknown)]
     rows = leave_out_faulty(episodes, rows, [key for key in _READ if key in episodes.features])
     unknown = 0 if include_unknown else known.count(None)

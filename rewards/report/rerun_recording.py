@@ -1,57 +1,56 @@
 """Measured trajectories for the rerun viewer: cameras, fingertips and curves on one timeline."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
+from touchgoal.control.features import IMAGE_PREFIX
 from touchgoal.episodes.schema import is_image
-from touchgoal.rewards.report.record import Record
+from touchgoal.rewards.report.record import COST, POTENTIAL, Record
 from touchgoal.rewards.sources.trajectory import Trajectory
-from touchgoal.runtime.atomic_write import atomic_write
-from touchgoal.runtime.errors import UserError, install_extra
-
-_JPEG_QUALITY = 90
-
-
-def load_rerun() -> Any:
-    """Import rerun; UserError if it is not installed."""
-    try:
-        import rerun  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise UserError(f"--rerun needs rerun-sdk: {install_extra('viz')}") from error
-    return rerun
+from touchgoal.runtime.viewer.stream import RerunStream, open_rerun
 
 
 def write_recording(
-    path: Path, trajectories: Sequence[Trajectory], records: Iterable[Path]
+    target: str, trajectories: Sequence[Trajectory], records: Iterable[Path]
 ) -> None:
-    """Write an .rrd of the trajectories that have a record; their pictures are read once more.
+    """Show the trajectories that have a record in rerun; their pictures are read once more.
 
-    Each trajectory has entities under its own name and begins at time 0. UserError: no rerun, or a
-    file of a trajectory is missing or unreadable.
+    Each trajectory has a tab and begins at time 0. UserError as `open_rerun`, or a file of a trajectory
+    is missing or unreadable.
     """
-    rerun, by_name = load_rerun(), {t.name: t for t in trajectories}
-    with atomic_write(path) as unfinished:
-        recording = rerun.RecordingStream("touchgoal")
-        recording.save(str(unfinished))
-        for record in map(Record.load, records):
-            if record.facts.name in by_name:
-                _log(rerun, recording, by_name[record.facts.name], record)
-        recording.disconnect()  # writes the rest
+    by_name = {t.name: t for t in trajectories}
+    with open_rerun(target) as stream:
+        shown = [r for r in map(Record.load, records) if r.facts.name in by_name]
+        images = [f"{r.facts.name}/{image}" for r in shown for image in r.sheets]
+        stream.show(images, [path for r in shown for path in _curves(r)], "time")
+        for record in shown:
+            _log(stream, by_name[record.facts.name], _curves(record))
 
 
-def _log(rerun: Any, recording: Any, trajectory: Trajectory, record: Record) -> None:
-    frame, name = 0, trajectory.name
+def _curves(record: Record) -> dict[str, Float[np.ndarray, " n"]]:
+    return {
+        f"{record.facts.name}/{plot}/{column.removeprefix(kind)}": values
+        for kind, plot in ((COST, "cost"), (POTENTIAL, "potential reward"))
+        for column, values in record.columns.items()
+        if column.startswith(kind)
+    }
+
+
+def _log(
+    stream: RerunStream, trajectory: Trajectory, curves: Mapping[str, Float[np.ndarray, " n"]]
+) -> None:
+    frame = 0
     for chunk in trajectory.chunks():
-        images = {key: values for key, values in chunk.frames.items() if is_image(key)}
+        images = {
+            f"{trajectory.name}/{key.removeprefix(IMAGE_PREFIX)}": values
+            for key, values in chunk.frames.items()
+            if is_image(key)
+        }
         for i in range(len(chunk)):
-            recording.set_time("frame", sequence=frame)
-            recording.set_time("time", duration=frame / trajectory.fps)
-            for key, values in images.items():
-                image = rerun.Image(np.asarray(values[i])).compress(jpeg_quality=_JPEG_QUALITY)
-                recording.log(f"{name}/{key.rpartition('.')[2]}", image)
-            for column, values in record.columns.items():
-                recording.log(f"{name}/curves/{column}", rerun.Scalars(float(values[frame])))
+            pictures = {path: values[i] for path, values in images.items()}
+            scalars = {path: values[frame] for path, values in curves.items()}
+            stream.log(frame, frame / trajectory.fps, pictures, scalars)
             frame += 1

@@ -9,28 +9,68 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 
 import cv2
 
+_LOOK = 1.0  # s between two looks at the workers
+
+
+class WorkerPool(ProcessPoolExecutor):
+    """Processes of one core each; the death of one in the middle of a result is noticed, too.
+
+    Python's pool would wait for the rest of that result, because it holds the pipe's other end itself.
+    """
+
+    def __init__(self, workers: int) -> None:
+        # OpenGL contexts do not survive a fork, so workers are forked from a server that never
+        # renders; it imports once what this process has imported
+        forkserver = multiprocessing.get_context("forkserver")
+        forkserver.set_forkserver_preload([m for m in sys.modules if m.startswith("touchgoal.")])
+        super().__init__(workers, mp_context=forkserver, initializer=_begin_work)
+        self._ended = threading.Event()
+        threading.Thread(target=self._notice_death, daemon=True).start()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """See Executor."""
+        self._ended.set()
+        super().shutdown(wait, cancel_futures=cancel_futures)
+
+    def end_at_once(self) -> None:
+        """Kill the workers and drop all work."""
+        self._kill()
+        self.shutdown(cancel_futures=True)
+
+    def _notice_death(self) -> None:
+        while not self._ended.wait(_LOOK):
+            dead = wait([worker.sentinel for worker in self._workers()], timeout=0)
+            if dead and not self._ended.wait(_LOOK) and not self._broken:
+                self._kill()
+                return
+
+    def _kill(self) -> None:
+        for worker in self._workers():
+            worker.kill()
+            worker.join()
+        self._result_queue._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _workers(self) -> list[BaseProcess]:
+        """Return the workers; none before the first task and after the end."""
+        return list((self._processes or {}).values())
+
 
 @contextmanager
-def one_core_workers(workers: int) -> Iterator[ProcessPoolExecutor]:
+def one_core_workers(workers: int) -> Iterator[WorkerPool]:
     """Open a pool of processes that use one core each.
 
-    OpenGL contexts do not survive a fork, so workers are forked from a server that never renders; it
-    imports once what this process has imported. If the block ends early, by Ctrl-C for example, or if
-    this process is killed, the workers end at once and drop their current work.
+    If the block ends early, by Ctrl-C for example, or if this process is killed, the workers end at
+    once and drop their current work.
     """
-    others = set(multiprocessing.active_children())
-    forkserver = multiprocessing.get_context("forkserver")
-    forkserver.set_forkserver_preload([m for m in sys.modules if m.startswith("touchgoal.")])
-    pool = ProcessPoolExecutor(workers, mp_context=forkserver, initializer=_begin_work)
+    pool = WorkerPool(workers)
     try:
         yield pool
     except BaseException:
-        for worker in set(multiprocessing.active_children()) - others:
-            worker.terminate()
-        pool.shutdown(cancel_futures=True)
+        pool.end_at_once()
         raise
     pool.shutdown()
 

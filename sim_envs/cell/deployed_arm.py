@@ -13,8 +13,8 @@ from touchgoal.control import features as ft
 from touchgoal.control.grippers.hand_commands import CLOSED_WIDTH, PERIOD, HandCommands, LastCommand
 from touchgoal.control.motion.tracker import SERVO_DAMPING, ServoLag, Tracker
 from touchgoal.control.safety.action_filter import ActionFilter, Measurements
+from touchgoal.sim_envs.cell.deployment import DeploymentConfig
 from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench
-from touchgoal.sim_envs.config import DeploymentConfig
 
 _DT = 1e-3  # s
 _WRENCH_PERIOD = 10  # ms between estimates of the force on the hand

@@ -14,9 +14,10 @@ from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.deployed_arm import DeployedArm
+from touchgoal.sim_envs.cell.deployment import IDEAL_DEPLOYMENT
 from touchgoal.sim_envs.cell.estimated_wrench import ForceMonitor
 from touchgoal.sim_envs.cell.hardware import SimulatedHardware
-from touchgoal.sim_envs.config import IDEAL_DEPLOYMENT, SETPOINT_PERIOD, EnvConfig
+from touchgoal.sim_envs.config import SETPOINT_PERIOD, EnvConfig
 from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, PadContact
 from touchgoal.sim_envs.scene.rendering import open_renderer
@@ -161,7 +162,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
             size = self.n_joints + 1
             raise ValueError(f"an action is {size} finite numbers, not {action}")
         if self.config.disturbance > 0:
-            action = action + np.append(self._disturbance(), 0.0)
+            action = action + np.append(self._disturbance(), self._width_disturbance())
         action = np.clip(action, self._limits.low, self._limits.high)
         before = self._progress
         self._command_before = self.command
@@ -255,6 +256,10 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         self._disturbance_state = keep * state + np.sqrt(1 - keep**2) * noise
         size = self.config.disturbance * np.repeat([1.0, self.disturbance_rotation], 3)
         return self.kinematics.joint_change(self.command, size * self._disturbance_state * tick)
+
+    def _width_disturbance(self) -> float:
+        """Draw a change of the target width (m); most tasks leave the width alone."""
+        return 0.0
 
     def _run_tick(self, delta: np.ndarray, width: float, seconds: float) -> None:
         """Run a tick with interpolated set-points; end it where the force is too high."""

@@ -24,6 +24,7 @@ GRIPPER_MAX_WIDTH = FRANKA_HAND.stroke[1]  # m, to which experts open
 GRIPPER_SPEED = FRANKA_HAND.speed  # m/s of width
 _FINGER_LAG = 1e-3  # m by which a freely moving finger lags its set-point, at most
 
+_RENDERERS = 2  # OpenGL contexts that are kept
 _LEAST_TORQUE = 2.0  # Nm; 20 N on the hand over the table, from any side, load some joint with more
 
 
@@ -38,7 +39,7 @@ class SimulatedHardware(ABC):
         self.kinematics = Kinematics(self.robot.arm, self.robot.tool.tcp_offset)
         self.grasp_force = 15.0  # N of each finger
         self.bodies: list[Body] = []  # objects of the scene, the task's first
-        self._renderer: Renderer | None = None
+        self._renderers: list[Renderer] = []  # the one in use first
         self._view_renderer: Renderer | None = None
         self.pads: list[TactilePad] = []  # left and right sensor; empty without `tactile`
 
@@ -120,9 +121,9 @@ class SimulatedHardware(ABC):
 
     def render_camera(self, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """Render a camera, RGB."""
-        assert self._renderer is not None
-        self._renderer.update_scene(self.data, camera)
-        return self._renderer.render()
+        renderer = self._renderers[0]
+        renderer.update_scene(self.data, camera)
+        return renderer.render()
 
     def read_tactile(self, side: int) -> TactileFrame:
         """Read the left (0) or right (1) sensor; `update_contacts` first, in order of time."""
@@ -154,14 +155,31 @@ class SimulatedHardware(ABC):
 
     def close(self) -> None:
         """Free the OpenGL contexts."""
-        for renderer in (self._renderer, self._view_renderer):
-            if renderer is not None:
-                renderer.close()
-        self._renderer, self._view_renderer = None, None
+        self._close_view()
+        while self._renderers:
+            self._renderers.pop().close()
+
+    def _show(self, model: mujoco.MjModel) -> None:
+        """Put the renderer for a model first: one that can show it, else a new one.
+
+        A new one and its first picture take 17 ms. Two are kept, because objects with and without a
+        mesh of their own take turns.
+        """
+        fits = next((r for r in self._renderers if r.show(model)), None)
+        if fits is None:
+            fits = open_renderer(model, *self.config.camera_size)
+        self._renderers = [fits, *(r for r in self._renderers if r is not fits)]
+        while len(self._renderers) > _RENDERERS:
+            self._renderers.pop().close()
+
+    def _close_view(self) -> None:
+        if self._view_renderer is not None:
+            self._view_renderer.close()
+        self._view_renderer = None
 
     def compile_scene(self, rng: np.random.Generator) -> None:
         """Compile the scene of `bodies`; `rng` draws sensors and, later, camera noise."""
-        self.close()
+        self._close_view()
         self._noise_rng = rng
         self.model = model = self.scene(self.config).compile()
         UsualScene.of(model).change(model, self.config.surroundings)
@@ -183,4 +201,4 @@ class SimulatedHardware(ABC):
             for side in (SIDES if self.config.tactile else ())
         ]
         if self.config.cameras:
-            self._renderer = open_renderer(model, *self.config.camera_size)
+            self._show(model)

@@ -13,7 +13,7 @@ from touchgoal.sim_envs.config import Outcome
 from touchgoal.sim_envs.experts.pick_place_plans import (
     LONGEST_PLAN,
     SLIDE,
-    Waypoint,
+    Plan,
     make_plan,
     picked_body,
 )
@@ -25,20 +25,22 @@ OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 class PickPlaceExpert:
     """Picks and places, or does what `outcome` says (`touchgoal.sim_envs.config.Outcome`)."""
 
-    def __init__(self, env: PickPlace, outcome: Outcome = "success") -> None:
-        """Plan an episode right after its reset.
+    def __init__(
+        self, env: PickPlace, outcome: Outcome = "success", plan: Plan | None = None
+    ) -> None:
+        """Plan an episode right after its reset; `plan` is followed in place of the outcome's.
 
         UserError: no such outcome, or one that this scene or time limit does not allow.
         """
         _check(env, outcome)
         self._env, self._picked = env, picked_body(outcome)
-        self._actions = self._follow(make_plan(env, outcome))
+        self._actions = self._follow(plan or make_plan(env, outcome))
 
     def act(self, observation: Observation) -> np.ndarray:
         """Return the next action, from ground truth; no motion once the plan is over."""
         return next(self._actions)
 
-    def _follow(self, plan: list[Waypoint]) -> Iterator[np.ndarray]:
+    def _follow(self, plan: Plan) -> Iterator[np.ndarray]:
         env = self._env
         position, _ = env.kinematics.forward(env.command)
         yaw, target_yaw = self._yaw_now(), env.grasp_yaw(self._picked)

@@ -39,12 +39,19 @@ class FeedbackExpert:
     yields to contact, does not follow a displaced object, and never lets go.
     """
 
-    def __init__(self, env: PickPlace) -> None:
-        """Begin an episode right after its reset."""
+    def __init__(
+        self,
+        env: PickPlace,
+        object_error: Float[np.ndarray, "3"] | None = None,
+        goal_error: Float[np.ndarray, "3"] | None = None,
+    ) -> None:
+        """Begin an episode right after its reset; by `object_error` and `goal_error` (m) it errs."""
         self._env = env
         self._object, self._yaw = env.object_pose()[:3].copy(), env.grasp_yaw()
         self._object[2] = max(self._object[2], LOWEST_GRASP)
         self._goal = np.array([*env.goal, self._object[2]])
+        self._object += 0 if object_error is None else object_error
+        self._goal += 0 if goal_error is None else goal_error
         self._before, _ = env.kinematics.forward(env.command)
         self._width = env.width()
 

@@ -5,6 +5,7 @@ World frame = the robot's base frame, table top at z = 0.
 
 import importlib.util
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import mujoco
@@ -41,17 +42,8 @@ def robot_model() -> Path:
 def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpec:
     """Build the scene's spec; tasks add to it before they compile it."""
     config = config or SceneConfig()
-    if config.arm == "ur5e":
-        spec = mujoco.MjSpec.from_file(str(_UR5E))
-    else:
-        spec = mujoco.MjSpec.from_file(str(robot_model()))
-        spec.meshdir = str(robot_model().parent / "meshes")
-        # No posture brings these together (none of 20,000 random ones did), but they lie so near
-        # that the solver would examine each pair in every step.
-        for i, k in ((0, 2), (2, 4), (3, 5)):
-            spec.add_exclude(bodyname1=f"fr3_link{i}", bodyname2=f"fr3_link{k}")
+    spec = _robot(config.arm, config.meshes).copy()
     set_options(spec, config)
-    _strip(spec, config)
     _compensate_gravity(spec.body("base"))
     for side in SIDES:
         add_fingertip(spec, side, find_sensor(config.sensor))
@@ -62,6 +54,22 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
             _place_camera(spec.camera(name), placement)
     for body in bodies:
         add_body(spec, body)
+    return spec
+
+
+@lru_cache(maxsize=4)  # reading and stripping it takes longer than compiling a scene
+def _robot(arm: str, meshes: str) -> mujoco.MjSpec:
+    """Return the spec of an arm alone, to be copied."""
+    if arm == "ur5e":
+        spec = mujoco.MjSpec.from_file(str(_UR5E))
+    else:
+        spec = mujoco.MjSpec.from_file(str(robot_model()))
+        spec.meshdir = str(robot_model().parent / "meshes")
+        # No posture brings these together (none of 20,000 random ones did), but they lie so near
+        # that the solver would examine each pair in every step.
+        for i, k in ((0, 2), (2, 4), (3, 5)):
+            spec.add_exclude(bodyname1=f"fr3_link{i}", bodyname2=f"fr3_link{k}")
+    _strip(spec, fast=meshes == "fast")
     return spec
 
 
@@ -94,7 +102,7 @@ def set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     visual.quality.numslices = 24
 
 
-def _strip(spec: mujoco.MjSpec, config: SceneConfig) -> None:
+def _strip(spec: mujoco.MjSpec, fast: bool) -> None:
     """Remove keyframes, servos and finger shapes of the wheel's model."""
     for item in [*spec.keys, *spec.actuators]:
         spec.delete(item)
@@ -107,9 +115,9 @@ def _strip(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     for body in spec.bodies:
         for geom in list(body.geoms):
             is_visual = geom.meshname != "" and not geom.meshname.endswith("_coll")
-            if is_visual and config.meshes == "fast":
+            if is_visual and fast:
                 spec.delete(geom)
-            elif not is_visual and config.meshes == "fast":
+            elif not is_visual and fast:
                 geom.group = VISUAL_GROUP
                 geom.rgba = [0.92, 0.92, 0.94, 1]
     used = {geom.meshname for body in spec.bodies for geom in body.geoms}

@@ -31,16 +31,17 @@ class SceneRecorder:
         self._ticks = 0
         self._pictures: list[np.ndarray] = []
 
-    def capture(self) -> None:
-        """Draw the environment; call it once per tick, every second call draws."""
+    def capture(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the newest picture; call it once per tick, every second call draws one."""
         self._ticks += 1
         if self._ticks % TICKS_PER_PICTURE != 1:
-            return
+            return self._pictures[-1]
         self._data.qpos[:] = self._env.data.qpos
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, "front")
         touch = [frame.image for frame in self._env.tactile_frames]
         self._pictures.append(_beside(self._renderer.render(), touch))
+        return self._pictures[-1]
 
     @property
     def pictures(self) -> UInt8[np.ndarray, "n h w 3"]:

@@ -1,6 +1,8 @@
 """Differences between two sensors of one model."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -26,7 +28,7 @@ class SensorInstance:
 
     calibration: SensorCalibration
     background: Int16[np.ndarray, "3 h w"]  # the untouched frame, RGB in units of COUNT_STEP
-    illumination: Float32[np.ndarray, "3 h3 w3"]  # light by channel, at half the image's resolution
+    illumination: Float32[np.ndarray, "3 h3 w3"]  # light by channel, half size; instances share it
     # camera noise in units of COUNT_STEP, on a tile larger than the frame by NOISE_MARGIN
     noise: Int8[np.ndarray, "3 h2 w2"]
     markers: Float32[np.ndarray, "n 2"]  # resting dots (x, y), px; none on a plain gel
@@ -51,7 +53,7 @@ def sample_instance(
     UserError: the model's sensor file is missing or damaged.
     """
     randomization = randomization or SensorRandomization()
-    typical = load(sensor.sensor_file)
+    typical, light = _typical(sensor)
     brightness = 1 + randomization.gain * rng.normal(size=3)
     turns = randomization.azimuth * rng.uniform(-1, 1, 3)
     blur_sigmas = tuple(
@@ -77,19 +79,31 @@ def sample_instance(
     common = np.sqrt(0.3)  # 0.3 of the noise variance is the same in all channels
     noise = common * rng.normal(size=(*tile[:2], 1)) + np.sqrt(0.7) * rng.normal(size=tile)
     markers, radius = _markers(sensor, pitch, randomization.markers, rng)
-    light = cv2.resize(
-        illumination(typical.background, typical.illumination_exponent),
-        (w // 2, h // 2),
-        interpolation=cv2.INTER_AREA,
-    )
     return SensorInstance(
         calibration,
         _planar(background / COUNT_STEP, np.int16),
-        _planar(light, np.float32),
+        light,
         _planar(np.clip(typical.noise / COUNT_STEP * noise, -127, 127), np.int8),
         markers,
         radius,
     )
+
+
+def _typical(sensor: SensorModel) -> tuple[SensorCalibration, Float32[np.ndarray, "3 h3 w3"]]:
+    """Return a model's sensor file and the light in it, kept until the file changes."""
+    folder = sensor.sensor_file
+    changed = tuple(p.stat().st_mtime_ns for p in sorted(folder.glob("*")))
+    return _read(folder, changed, sensor.image_shape)
+
+
+@lru_cache(maxsize=4)
+def _read(
+    folder: Path, changed: tuple[int, ...], shape: tuple[int, int]
+) -> tuple[SensorCalibration, Float32[np.ndarray, "3 h3 w3"]]:
+    typical, half = load(folder), (shape[1] // 2, shape[0] // 2)
+    light = illumination(typical.background, typical.illumination_exponent)
+    light = _planar(cv2.resize(light, half, interpolation=cv2.INTER_AREA), np.float32)
+    return typical, light
 
 
 def _planar(image: Shaped[np.ndarray, "h w 3"], kind: type) -> Shaped[np.ndarray, "3 h w"]:

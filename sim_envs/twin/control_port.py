@@ -123,7 +123,7 @@ class ControlPort(Service):
             "truth": self._cell.truth,
             "hold": lambda: self._held_time().hold(client),
             "advance": None,
-            "pictures": lambda: self._held_time() and self._pictures.sent(),
+            "pictures": None,
             "reset": lambda: self._reset(*rest.split(" ", 1)),
             "freeze": lambda: self._freeze(*_finite(rest)),
             "drop": self._arm.drop,
@@ -146,6 +146,9 @@ class ControlPort(Service):
             if command == "advance":
                 steps, driven, commands = (int(number) for number in rest.split())
                 self._held_time().advance(client, steps, bool(driven), commands)
+                return None
+            if command == "pictures":
+                self._held_time().count_pictures(client)
                 return None
             return actions[command]() or {"ok": True}
         except (UserError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:

@@ -40,25 +40,29 @@ class LockStep:
         self._left = 0  # steps asked for and not yet made
         self._driven, self._issued, self._until = False, 0, 0.0
         self._commands_before = self._answers_before = 0
-        self._asked = False  # whether the holder waits for an answer
+        self._asked = self._asks_pictures = False  # whether the holder waits for an answer
 
     def hold(self, client: ClientConnection) -> dict[str, Any]:
         """Give the time to a client until it leaves; UserError if another holds it."""
         if self.held:
             raise UserError("another program holds the time of this twin")
-        self._holder, self._left, self._asked = client, 0, False
+        self._holder, self._left, self._asked, self._asks_pictures = client, 0, False, False
         self._commands_before, self._answers_before = self._hand.commands, self._hand.answers
         self._pictures.held = True
-        return self._report() | {"pictures": self._pictures.sent()}
+        return self._report()
 
     def advance(self, client: ClientConnection, steps: int, driven: bool, issued: int) -> None:
         """Advance by a number of steps; the answer follows when they are made."""
-        if client is not self._holder:
-            raise UserError("hold the time of this twin first")
+        self._check_holder(client)
         if not 0 < steps <= _MOST_STEPS:
             raise UserError(f"steps are a number from 1 to {_MOST_STEPS}")
         self._left, self._asked, self._until = steps, True, time.monotonic() + _PATIENCE
         self._driven, self._issued = driven, issued
+
+    def count_pictures(self, client: ClientConnection) -> None:
+        """Tell the holder how many pictures were sent, once all due ones are."""
+        self._check_holder(client)
+        self._asks_pictures = True
 
     @property
     def held(self) -> bool:
@@ -75,8 +79,10 @@ class LockStep:
             return False
         if self._asked and not self._left and (self._arm.answered or self._impatient):
             self._asked = False
-            assert self._holder is not None
-            self._holder.send(json.dumps(self._report()).encode() + b"\n")
+            self._answer(self._report())
+        if self._asks_pictures and self._pictures.all_sent:
+            self._asks_pictures = False
+            self._answer(self._pictures.sent)
         return True
 
     def count_step(self) -> None:
@@ -86,7 +92,12 @@ class LockStep:
     def wait(self, sockets: Sequence[Any]) -> None:
         """Wait briefly for a message of the arm's or hand's client, or on these sockets."""
         links = [*self._arm.link.sockets, *self._hand.link.sockets]
-        select.select([*links, *sockets], [], [], _POLL_INTERVAL)
+        drawn = [self._pictures] if self._asks_pictures else []
+        select.select([*links, *sockets, *drawn], [], [], _POLL_INTERVAL)
+
+    def _check_holder(self, client: ClientConnection) -> None:
+        if client is not self._holder:
+            raise UserError("hold the time of this twin first")
 
     def _ready(self) -> bool:
         if self._arm.link.frozen or self._impatient:
@@ -97,6 +108,10 @@ class LockStep:
     @property
     def _impatient(self) -> bool:
         return time.monotonic() > self._until
+
+    def _answer(self, answer: dict[str, Any]) -> None:
+        assert self._holder is not None
+        self._holder.send(json.dumps(answer).encode() + b"\n")
 
     def _report(self) -> dict[str, Any]:
         return {

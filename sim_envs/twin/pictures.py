@@ -15,7 +15,7 @@ from touchgoal.sim_envs.twin.picture_process import STATE, Fault, RenderRequest,
 from touchgoal.sim_envs.twin.tcp_ports import Service
 
 CAMERA_RATE = 25  # Hz, as a fingertip's; more than a policy reads
-_START_TIMEOUT, _ANSWER_TIMEOUT, _END_TIMEOUT = 120.0, 60.0, 5.0  # s, on a loaded machine, too
+_START_TIMEOUT, _END_TIMEOUT = 120.0, 5.0  # s, on a loaded machine, too
 _MOST_BEHIND = 2  # unanswered requests in real time, beyond which images are left out
 _PROGRAM = "from touchgoal.sim_envs.twin.picture_process import main; main()"
 
@@ -39,8 +39,8 @@ class Pictures(Service):
             tuple(name for name, rate in self.rates.items() if ms * rate % 1000 < rate)
             for ms in range(1000)
         ]
-        # processor_time: of the rendering process, s, as last reported
-        self._sent, self.processor_time = dict.fromkeys(self.rates, 0), 0.0
+        # sent: number of images sent on each stream; processor_time: of the rendering process, s
+        self.sent, self.processor_time = dict.fromkeys(self.rates, 0), 0.0
         self._unanswered = 0
         self._pipe, theirs = Pipe()
         self._process = subprocess.Popen(  # own session: Ctrl-C is for the twin, which ends it
@@ -72,11 +72,15 @@ class Pictures(Service):
             self._unanswered += 1
             self.taken += len(due)
 
-    def sent(self) -> dict[str, int]:
-        """Return the number of images sent on each stream, once all due ones are."""
-        while self._unanswered:
-            self._hear(_ANSWER_TIMEOUT)
-        return self._sent
+    @property
+    def all_sent(self) -> bool:
+        """Whether all due images are sent."""
+        self._hear()
+        return not self._unanswered
+
+    def fileno(self) -> int:
+        """Return the descriptor on which answers arrive, for `select`."""
+        return self._pipe.fileno()
 
     def set_fault(self, name: str, kind: str, seconds: float) -> None:
         """Make a stream stalled, frozen, lost, broken or halved; KeyError if there is none."""
@@ -114,13 +118,11 @@ class Pictures(Service):
         except OSError as error:
             raise _ended() from error
 
-    def _hear(self, timeout: float = 0.0) -> None:
-        """Take answers that have arrived; with a time-out (s), wait for one."""
+    def _hear(self) -> None:
+        """Take answers that have arrived."""
         try:
-            if timeout and not self._pipe.poll(timeout):
-                raise TimeoutError
             while self._unanswered and self._pipe.poll():
-                self._sent, self.processor_time = self._pipe.recv()
+                self.sent, self.processor_time = self._pipe.recv()
                 self._unanswered -= 1
         except (OSError, EOFError) as error:
             raise _ended() from error

@@ -41,6 +41,11 @@ gymnasium.register(
     "touchgoal/BeadMaze-v0", "touchgoal.sim_envs.bead_maze:BeadMaze", max_episode_steps=800
 )
 gymnasium.register(
+    "touchgoal/FragileCarry-v0",
+    "touchgoal.sim_envs.fragile_carry:FragileCarry",
+    max_episode_steps=160,
+)
+gymnasium.register(
     "touchgoal/TouchWand-v0", "touchgoal.sim_envs.touch_wand:TouchWand", max_episode_steps=50
 )
 

@@ -1,5 +1,5 @@
 """touchgoal's policy in touchgoal's environment by lerobot-eval, against touchgoal's own loop; a twin's
-arm through lerobot's robot interface.
+arm and a fingertip through lerobot's interfaces.
 
     python tests/interop/lerobot_plugins.py PYTHON      PYTHON: of an environment with lerobot
 
@@ -76,6 +76,7 @@ def main() -> None:
         folder, plugins = Path(name), Path(name) / "plugins"
         install = [python, "-m", "pip", "install", "-q", "--no-deps", "--target", plugins]
         subprocess.run([*install, ROOT / "plugins"], check=True)
+        print(run_with_plugins(plugins, python, HERE / "lerobot_camera.py", folder))
         (folder / "twin").mkdir()
         with closing(RunningTwin(TWIN, folder / "twin", 0)) as twin:
             print(run_with_plugins(plugins, python, HERE / "lerobot_arm.py", twin.cell_file))

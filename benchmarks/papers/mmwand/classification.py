@@ -24,8 +24,16 @@ from touchgoal.benchmarks.papers.mmwand.fine_tuned import (
 )
 from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_classification
-from touchgoal.encoders.alignment.splits import split_touches
+from touchgoal.benchmarks.papers.mmwand.trained import (
+    Trainable,
+    embed_touches,
+    read_touch_data,
+    train,
+)
+from touchgoal.encoders.alignment.config import AlignConfig
+from touchgoal.encoders.alignment.splits import Fold
 from touchgoal.encoders.alignment.wand_set import WandSet
+from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
@@ -54,12 +62,17 @@ class Config(BenchmarkOptions):
     """Units held out; whole objects cannot be, because an unseen object has no name to find."""
     seeds: Count = 3
     """Splits of each kind."""
+    trained: tuple[Trainable, ...] = ()
+    """Touch backbones to align with images and words on each split's touches before the probe, as the
+    paper does; slow."""
+    trained_epochs: Count = 20
+    """Passes of this alignment over the touches."""
     fine_tuned: tuple[Network, ...] = ()
     """Networks to fine-tune as well, on each split and modality; slow."""
     modalities: tuple[Modality, ...] = ("image", "touch", "both")
     """Inputs of the fine-tuned networks."""
     epochs: Count = 12
-    """Passes of their training over the touches."""
+    """Passes of the fine-tuning over the touches."""
     picture_rows: Count = 112
     """Rows of their pictures, px."""
     device: str = "cpu"
@@ -80,13 +93,31 @@ def run(config: Config) -> dict[str, Any]:
     for name in config.encoders:
         inputs[name] = data.touch[name]
         inputs[f"images + {name}"] = np.hstack([_standard(image), _standard(data.touch[name])])
-    rows = [
-        {"split": split, "input": name, **_judge(data, embedding, split, config.seeds)}
-        for split in config.splits
-        for name, embedding in inputs.items()
-    ]
-    rows += _fine_tuned(config, data)
+    rows = []
+    for split in config.splits:
+        folds = [data.fold(split, seed) for seed in range(config.seeds)]
+        rows += [
+            {"split": split, "input": name, **_judge(data.label, embedding, folds)}
+            for name, embedding in inputs.items()
+        ]
+    rows += _trained(config, data) + _fine_tuned(config, data)
     return {"table": _table(rows, len(data.names)), "rows": rows}
+
+
+def _trained(config: Config, data: EmbeddedSet) -> list[dict[str, Any]]:
+    if not config.trained:
+        return []
+    towers, rows = load_towers("offline"), []
+    touches = read_touch_data(WandSet.open(config.data), towers)
+    for split in config.splits:
+        fold = data.fold(split, config.seed)
+        for backbone in config.trained:
+            align = AlignConfig(backbone=backbone, epochs=config.trained_epochs)
+            encoder = train(touches, fold, data.sensor, towers, align, config.seed)
+            embedding = embed_touches(encoder, touches)
+            found = _judge(data.label, embedding, [fold])
+            rows.append({"split": split, "input": f"{backbone} trained", **found})
+    return rows
 
 
 def _fine_tuned(config: Config, data: EmbeddedSet) -> list[dict[str, Any]]:
@@ -95,7 +126,7 @@ def _fine_tuned(config: Config, data: EmbeddedSet) -> list[dict[str, Any]]:
     check_device(config.device)
     pictures, rows = read_pictures(WandSet.open(config.data), config.picture_rows), []
     for split in config.splits:
-        fold = split_touches(split, data.label, data.visit, data.describes, config.seed)
+        fold = data.fold(split, config.seed)
         for network in config.fine_tuned:
             for modality in config.modalities:
                 inputs = list(pictures.values()) if modality == "both" else [pictures[modality]]
@@ -108,23 +139,19 @@ def _fine_tuned(config: Config, data: EmbeddedSet) -> list[dict[str, Any]]:
 
 
 def _judge(
-    data: EmbeddedSet,
-    embedding: Float[np.ndarray, "n d"],
-    split: Literal["sample", "press"],
-    seeds: int,
+    label: Int[np.ndarray, " n"], embedding: Float[np.ndarray, "n d"], folds: list[Fold]
 ) -> dict[str, Interval]:
     hits: dict[str, list[np.ndarray]] = {"probe": [], "nearest": []}
     objects = []
-    for seed in range(seeds):
-        fold = split_touches(split, data.label, data.visit, data.describes, seed)
-        x, y = torch.from_numpy(embedding).float(), torch.from_numpy(data.label)
+    x, y = torch.from_numpy(embedding).float(), torch.from_numpy(label)
+    for fold in folds:
         train, test = ((x[rows], y[rows]) for rows in (fold.train, fold.test))
         hits["probe"].append((probe(*train)(test[0]).argmax(1) == test[1]).numpy().astype(float))
         unit = F.normalize(train[0], dim=1), F.normalize(test[0], dim=1)
         hits["nearest"].append(
             (train[1][(unit[1] @ unit[0].T).argmax(1)] == test[1]).numpy().astype(float)
         )
-        objects.append(data.label[fold.test])
+        objects.append(label[fold.test])
     return {
         what: mean_over_objects(np.concatenate(objects), np.concatenate(h))
         for what, h in hits.items()

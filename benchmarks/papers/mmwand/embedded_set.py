@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int
 
 from touchgoal.benchmarks.real_touch.embedders import find_embedder
+from touchgoal.encoders.alignment.config import Split
+from touchgoal.encoders.alignment.splits import Fold, split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.ssl.frames import find_sensor_name
 from touchgoal.encoders.towers.towers import load_towers
@@ -33,6 +35,10 @@ class EmbeddedSet:
     image: Float32[np.ndarray, "n v i"]  # image tower's embeddings of the v views
     touch: dict[str, Float32[np.ndarray, "n _"]]  # encoder -> touch embeddings
     pixels: Float32[np.ndarray, "n p"]  # change against the untouched gel, 40 x 30 px with its sign
+
+    def fold(self, split: Split, seed: int) -> Fold:
+        """Hold out a fifth, see `split_touches`."""
+        return split_touches(split, self.label, self.visit, self.describes, seed)
 
 
 def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> EmbeddedSet:

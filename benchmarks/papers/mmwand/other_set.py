@@ -17,7 +17,6 @@ from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_s
 from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.heads import Heads, PairedEmbeddings, fit_heads
-from touchgoal.encoders.alignment.splits import split_touches
 from touchgoal.rewards.report.text_table import aligned
 from touchgoal.runtime.errors import UserError
 
@@ -73,7 +72,7 @@ def run_other_set(
 
 
 def _seen_objects(data: EmbeddedSet, seed: int) -> Bool[np.ndarray, " k"]:
-    fold = split_touches("object", data.label, data.visit, data.describes, seed)
+    fold = data.fold("object", seed)
     return np.isin(np.arange(len(data.names)), data.label[fold.train])
 
 
@@ -81,7 +80,7 @@ def _training_rows(
     data: EmbeddedSet, seen: Bool[np.ndarray, " k"], seed: int
 ) -> Int[np.ndarray, " r"]:
     """Return the touches of seen objects on the training side of whole visits."""
-    fold = split_touches("press", data.label, data.visit, data.describes, seed)
+    fold = data.fold("press", seed)
     return fold.train[seen[data.label[fold.train]]]
 
 
@@ -114,7 +113,7 @@ def _count(
     """Add, by column of the table, the object and the hit of each touch that is judged."""
     texts = heads.text(torch.from_numpy(data.texts)).detach()
     similarity = (F.normalize(embedded, dim=1) @ texts.T).numpy()
-    held_out = split_touches("press", data.label, data.visit, data.describes, seed).test
+    held_out = data.fold("press", seed).test
     rng = np.random.default_rng([seed, 7])
     every = np.arange(len(data.label))
     for column, kept, judged in (("seen", seen, held_out), ("unseen", ~seen, every)):

@@ -11,7 +11,7 @@ from dataclasses import field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,12 +22,17 @@ from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
 from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_retrieval
-from touchgoal.benchmarks.papers.mmwand.trained import embed_fold, read_touch_data, train
+from touchgoal.benchmarks.papers.mmwand.trained import (
+    Trainable,
+    embed_fold,
+    read_touch_data,
+    train,
+)
 from touchgoal.encoders.alignment.config import AlignConfig, HeadsConfig, Split
 from touchgoal.encoders.alignment.data import TouchData
 from touchgoal.encoders.alignment.heads import PairedEmbeddings, fit_heads
 from touchgoal.encoders.alignment.retrieval import average_precisions
-from touchgoal.encoders.alignment.splits import SPLITS, Fold, split_touches
+from touchgoal.encoders.alignment.splits import SPLITS, Fold
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
@@ -61,7 +66,7 @@ class Config(BenchmarkOptions):
     """Splits and heads of each kind, each with another seed."""
     heads: HeadsConfig = HeadsConfig()
     """Training of the heads."""
-    trained: tuple[Literal["vit-small", "efficientnet"], ...] = ()
+    trained: tuple[Trainable, ...] = ()
     """Touch backbones to train on each split's touches, with and without the touch-text loss, one seed
     each; slow."""
     epochs: Count = 20
@@ -90,9 +95,8 @@ def run(config: Config) -> dict[str, Any]:
     rows, pools = [], {}
     work = list(product(config.splits, judged | once))
     for split, what in track(work, "retrieval", "row"):
-        own = data.label, data.visit, data.describes
         seeds = range(1 if what in once else config.seeds)
-        folds = [split_touches(split, *own, seed) for seed in seeds]
+        folds = [data.fold(split, seed) for seed in seeds]
         judge_fold = (judged | once)[what]
         found = [judge_fold(data, fold, seed) for seed, fold in enumerate(folds)]
         rows.append({"split": split, "row": what, "seeds": len(folds), **_summary(found)})

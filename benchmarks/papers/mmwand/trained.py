@@ -3,6 +3,7 @@
 import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,6 +26,8 @@ from touchgoal.encoders.towers.towers import Towers
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import Training, fit
 
+Trainable = Literal["vit-small", "efficientnet"]
+"""Touch backbones that two cores train on a set of touches."""
 _BATCH = 64
 
 
@@ -64,10 +67,17 @@ def embed_fold(
 ) -> dict[str, Float[np.ndarray, "_ d"]]:
     """Return unit vectors of the test touches, their views, and the test sentences."""
     rows = torch.from_numpy(fold.test)
-    touch = torch.cat([encoder.embed_touch(b.float()) for b in data.touch[rows].split(_BATCH)])
     image = encoder.project_image(data.images[data.view_index[rows]])
     text = encoder.project_text(data.texts[torch.from_numpy(fold.test_text)])
     return {
-        k: F.normalize(v, dim=1).numpy()
-        for k, v in dict(touch=touch, image=image, text=text).items()
+        "touch": embed_touches(encoder, data.take(rows)),
+        "image": F.normalize(image, dim=1).numpy(),
+        "text": F.normalize(text, dim=1).numpy(),
     }
+
+
+@torch.no_grad()
+def embed_touches(encoder: TouchEncoder, data: TouchData) -> Float[np.ndarray, "n d"]:
+    """Return unit vectors of all touches."""
+    touch = torch.cat([encoder.embed_touch(b.float()) for b in data.touch.split(_BATCH)])
+    return F.normalize(touch, dim=1).numpy()

@@ -15,9 +15,9 @@ from touchgoal.encoders.preprocess import Preprocessor
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.cloths import CLOTHS
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import simulate
+from touchgoal.sim_envs.tactile.rig.cloths import CLOTHS
 
 STRIDE = 5  # frames between the two of a pair, as in Sparsh: 83 ms at the rig's 60 Hz
 _PRESSED_IS_POSITIVE = np.array([1, 1, -1], np.float32)

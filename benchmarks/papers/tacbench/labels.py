@@ -19,7 +19,7 @@ from touchgoal.benchmarks.papers.tacbench.task import (
 )
 from touchgoal.encoders.probes.attentive import AttentiveProbe
 from touchgoal.encoders.probes.property_probe import interval
-from touchgoal.sim_envs.cloths import CLOTHS
+from touchgoal.sim_envs.tactile.rig.cloths import CLOTHS
 
 
 class LabelTask:

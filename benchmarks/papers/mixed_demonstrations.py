@@ -1,0 +1,107 @@
+"""Demonstrations of mixed quality: by the feedback expert, without a mistake or with one."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
+from touchgoal.benchmarks.papers.reward_quality.recording import Recorded
+from touchgoal.control.features import Observation
+from touchgoal.episodes.recording import EpisodeSpec, collect, missing_specs
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime import seeds
+from touchgoal.runtime.parallel.parallel_map import Workers
+from touchgoal.sim_envs.cell.hardware import GRIPPER_MAX_WIDTH
+from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
+from touchgoal.sim_envs.pick_place import PickPlace
+
+Mistake = Literal["none", "beside", "above", "drop", "freeze"]
+"""Mistake of a demonstration, in this order: none; the object is put down 4 to 8 cm beside the goal; the
+hand closes 5 to 8 cm above the object; it lets go on the way; it stops somewhere."""
+_RIGHT: tuple[Mistake, ...] = ("none",)
+_MISTAKES: tuple[Mistake, ...] = ("beside", "above", "drop", "freeze")
+_TWENTY: tuple[Mistake, ...] = (*_RIGHT * 8, *_MISTAKES * 3)  # eight of twenty are right
+_DISTURBANCE = 0.01  # m/s, so that corrections are shown
+_CARRIED = (0.5, 1.5)  # s between grasp and letting go
+_STOPS = (1.0, 4.0)  # s from the start
+_FIRST_SEED = seeds.REWARD_TEST.start + 700_000  # the judged episodes of reward-quality end before
+
+
+@dataclass(frozen=True)
+class MixedRoles:
+    """Actor and expert of a recording, see `Roles` in `episodes/recording.py`."""
+
+    mistakes: tuple[Mistake, ...] = _TWENTY  # taken in turn by the episode's seed
+
+    def __call__(self, env: Any, spec: EpisodeSpec) -> tuple["MistakenExpert", "MistakenExpert"]:
+        """Return one hand for both roles: its mistakes are what is recorded."""
+        expert = MistakenExpert(env, self.mistakes[spec.seed % len(self.mistakes)])
+        return expert, expert
+
+
+class MistakenExpert:
+    """The feedback expert with one mistake."""
+
+    def __init__(self, env: PickPlace, mistake: Mistake) -> None:
+        """Begin an episode right after its reset."""
+        rng, hz = env.np_random.spawn(1)[0], env.config.control_hz
+        self._env, self._mistake = env, mistake
+        self._ticks_left = round(hz * rng.uniform(*(_CARRIED if mistake == "drop" else _STOPS)))
+        object_error, goal_error = np.zeros(3), np.zeros(3)
+        if mistake == "above":
+            object_error[2] = rng.uniform(0.05, 0.08)
+        if mistake == "beside":
+            angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(0.04, 0.08)
+            goal_error[:2] = distance * np.array([np.cos(angle), np.sin(angle)])
+        self._expert = FeedbackExpert(env, object_error, goal_error)
+        self._last = np.append(np.zeros(env.n_joints), GRIPPER_MAX_WIDTH)
+
+    def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
+        """Return the next action, from ground truth; call it at every tick."""
+        if self._mistake == "freeze" or (self._mistake == "drop" and self._holds()):
+            self._ticks_left -= 1
+        if self._ticks_left < 0:
+            width = GRIPPER_MAX_WIDTH if self._mistake == "drop" else self._last[-1]
+            return np.append(np.zeros(self._env.n_joints), width)
+        self._last = self._expert.act(observation)
+        return self._last
+
+    def _holds(self) -> bool:
+        return all(pad.touching for pad in self._env.pad_contacts())
+
+
+def record_mixed(
+    folder: Path, count: int, env: PickPlaceConfig, workers: Workers
+) -> list[Recorded]:
+    """Record `count` demonstrations, right and wrong; return them with what came of each."""
+    return _record(folder, count, _FIRST_SEED, MixedRoles(), env, workers)
+
+
+def record_right(
+    folder: Path, count: int, env: PickPlaceConfig, workers: Workers
+) -> list[Recorded]:
+    """Record `count` demonstrations without a mistake, to validate on."""
+    return _record(folder, count, _FIRST_SEED + 50_000, MixedRoles(_RIGHT), env, workers)
+
+
+def _record(
+    folder: Path, count: int, seed: int, roles: MixedRoles, env: PickPlaceConfig, workers: Workers
+) -> list[Recorded]:
+    objects = HELD_OUT_OBJECTS
+    specs = [
+        EpisodeSpec(seed + k, options={"object": objects[(k + k // 20) % len(objects)]})
+        for k in range(count)
+    ]
+    missing = missing_specs(folder, specs)
+    if missing:
+        collect(folder, replace(env, disturbance=_DISTURBANCE), missing, workers, roles)
+    episodes = EpisodeSet(folder)
+    metas = [episodes.meta(i) for i in range(count)]
+    return [
+        Recorded(folder, i, "test", str(meta["outcome"]), str(meta["object"]), "elsewhere")
+        for i, meta in enumerate(metas)
+    ]

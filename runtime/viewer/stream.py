@@ -1,0 +1,146 @@
+"""Stream of images and curves to the rerun viewer: to an .rrd file, or live to a viewer."""
+
+import os
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from queue import Full, Queue
+from threading import Thread
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from touchgoal.runtime.atomic_write import atomic_write
+from touchgoal.runtime.errors import UserError, install_extra
+from touchgoal.runtime.viewer.layout import lay_out
+
+LIVE = "live"
+_JPEG_QUALITY = 90
+_WAITING = 60  # ticks that may wait for the background thread, 3 s at 20 Hz
+
+
+class RerunStream:
+    """An open recording, laid out by the paths that are logged (`lay_out`).
+
+    Each tick is logged on the timelines "frame" and, where it is known, "time".
+    """
+
+    def __init__(self, rerun: Any, recording: Any) -> None:
+        """Log to that recording of the module rerun."""
+        self._rerun, self._recording = rerun, recording
+        # paths so far, in order
+        self._images: dict[str, None] = {}
+        self._scalars: dict[str, None] = {}
+
+    def show(self, images: Iterable[str], scalars: Iterable[str], timeline: str) -> None:
+        """Give these paths their views, as `lay_out`.
+
+        `log` does so when a path first appears, and each time sends the whole layout again: where there
+        are many trajectories, name all paths beforehand.
+        """
+        self._images |= dict.fromkeys(images)
+        self._scalars |= dict.fromkeys(scalars)
+        self._recording.send_blueprint(lay_out(self._images, self._scalars, timeline))
+
+    def log(
+        self,
+        frame: int,
+        seconds: float | None,
+        images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+        scalars: Mapping[str, float],
+    ) -> None:
+        """Log one tick: images "TRAJECTORY/IMAGE", scalars "TRAJECTORY/PLOT/CURVE"; `seconds` if known."""
+        if not (images.keys() <= self._images.keys() and scalars.keys() <= self._scalars.keys()):
+            self.show(images, scalars, "frame" if seconds is None else "time")
+        self._recording.set_time("frame", sequence=frame)
+        if seconds is not None:
+            self._recording.set_time("time", duration=seconds)
+        for path, image in images.items():
+            picture = self._rerun.Image(np.asarray(image)).compress(jpeg_quality=_JPEG_QUALITY)
+            self._recording.log(path.split("/"), picture)
+        for path, value in scalars.items():
+            self._recording.log(path.split("/"), self._rerun.Scalars(float(value)))
+
+
+class BackgroundStream:
+    """A stream for a control loop: `log` never waits, a thread compresses and writes."""
+
+    def __init__(self, target: str) -> None:
+        """Open it as `open_rerun` and start the thread."""
+        self._opened = ExitStack()
+        self._stream = self._opened.enter_context(open_rerun(target))
+        self._dropped = 0  # ticks that found the queue full
+        self._queue: Queue[tuple[Any, ...] | None] = Queue(_WAITING)
+        self._error: Exception | None = None
+        self._thread = Thread(target=self._work, name="rerun", daemon=True)
+        self._thread.start()
+
+    def log(self, *tick: Any) -> None:
+        """Hand over a tick, as `RerunStream.log`; its arrays must not change later."""
+        try:
+            self._queue.put_nowait(tick)
+        except Full:
+            self._dropped += 1
+
+    def close(self) -> str:
+        """Write what waits; return what went wrong, "" if nothing did.
+
+        A failed recording must not hide the report of the run, so nothing is raised.
+        """
+        self._queue.put(None)
+        self._thread.join()
+        try:
+            self._opened.close()
+        except OSError as error:
+            self._error = self._error or error
+        if self._error is not None:
+            return f"--rerun stopped recording: {self._error}"
+        return f"--rerun left out {self._dropped} ticks" if self._dropped else ""
+
+    def _work(self) -> None:
+        while (tick := self._queue.get()) is not None:
+            if self._error is None:
+                try:
+                    self._stream.log(*tick)
+                except Exception as error:  # `close` reports it: no arm stops for a viewer
+                    self._error = error
+
+
+def load_rerun(target: str) -> Any:
+    """Import rerun; UserError if it is missing, or the target neither a file nor a viewer on a screen."""
+    if target != LIVE and Path(target).suffix != ".rrd":
+        raise UserError(f"--rerun takes {LIVE} or a file that ends in .rrd, not {target}")
+    try:
+        import rerun  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise UserError(f"--rerun needs rerun-sdk: {install_extra('viz')}") from error
+    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if target == LIVE and sys.platform == "linux" and not screen:
+        raise UserError("--rerun live needs a screen: give a file, --rerun FILE.rrd")
+    return rerun
+
+
+@contextmanager
+def open_rerun(target: str) -> Iterator[RerunStream]:
+    """Open a stream to an .rrd file, which is complete or absent, or to a viewer ("live").
+
+    UserError as `load_rerun`, or the viewer does not start.
+    """
+    rerun = load_rerun(target)
+    recording = rerun.RecordingStream("touchgoal")
+    if target == LIVE:
+        try:
+            recording.spawn()
+        except Exception as error:  # rerun's own classes differ by version
+            raise UserError(f"--rerun live: the viewer does not start ({error})") from error
+        try:
+            yield RerunStream(rerun, recording)
+        finally:
+            recording.disconnect()
+        return
+    with atomic_write(Path(target)) as unfinished:
+        recording.save(str(unfinished))
+        yield RerunStream(rerun, recording)
+        recording.disconnect()  # writes the rest

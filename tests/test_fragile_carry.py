@@ -1,0 +1,71 @@
+"""Fragile carry: what holds one rod crushes another, and slip says which one it is."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from in_process import run
+
+from touchgoal.control import features as ft
+from touchgoal.episodes.recording import EpisodeSpec, record_episode
+from touchgoal.sim_envs.config import FragileCarryConfig
+from touchgoal.sim_envs.experts.fragile_carry import FragileCarryExpert
+from touchgoal.sim_envs.fragile_carry import FragileCarry, width_for
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[FragileCarry]:
+    env = FragileCarry(FragileCarryConfig(tactile=False))
+    yield env
+    env.close()
+
+
+def carry(env: FragileCarry, hold_force: float, force: float | None = None) -> list[str]:
+    """Return what failed; the expert moves the hand, with its own force or a constant one (N)."""
+    env.reset(seed=0, options={"hold_force": hold_force})
+    expert = FragileCarryExpert(env)
+    while True:
+        action = expert.act({})
+        if force is not None:
+            action[-1] = width_for(force)
+        _, _, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            break
+    assert bool(info[ft.TRUTH_SUCCESS]) == (not env.failures())
+    return env.failures()
+
+
+@pytest.mark.parametrize("hold_force", [1.0, 2.8, 8.0])
+def test_expert_carries_every_rod(env: FragileCarry, hold_force: float) -> None:
+    assert not carry(env, hold_force)
+
+
+@pytest.mark.parametrize(
+    ("hold_force", "failed"), [(1.0, "crushed"), (2.8, ""), (4.0, "tilted"), (8.0, "dropped")]
+)
+def test_one_force_does_not_fit_all(env: FragileCarry, hold_force: float, failed: str) -> None:
+    assert carry(env, hold_force, force=4.5) == [failed] * bool(failed)
+
+
+def test_expert_recovers_from_a_disturbed_squeeze() -> None:
+    env = FragileCarry(FragileCarryConfig(tactile=False, disturbance=0.002))
+    episode = record_episode(env, EpisodeSpec(seed=1))
+    assert episode.meta["success"] and episode.meta["task"] == "fragile-carry"
+    assert np.ptp(episode.frames[ft.STATE][30:, -1]) > 0  # the width varies
+
+
+def test_commands_from_demonstrations_to_a_table(tmp_path: Path, capsys) -> None:
+    one = ("--workers", 1)
+    data, val, policy = (tmp_path / name for name in ("data", "val", "policy"))
+    record = ("collect-demos", "--task", "fragile-carry", "--episodes", 1, *one)
+    run(*record, "--out", data)
+    run(*record, "--seed", 1, "--out", val)
+    run("train-policy", "--data", data / "episodes", "--validation", val / "episodes", "--out", policy,
+        "--head", "regression", "--representation", "base_twist", "--hand-force", "--train.epochs", 1,
+        "--trials", 0, *one)  # fmt: skip
+    run("benchmark", "fragile-carry", "--policies", policy / "policy", "--episodes", 1, "--env.max-seconds", 1,
+        *one, "--out", tmp_path / "table")  # fmt: skip
+    printed = capsys.readouterr().out
+    assert re.search("^state, force on the hand +0/1 ", printed, re.M)
