@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from touchgoal.control.features import FRONT, TRUTH_CONTACT, WRENCH
+from touchgoal.encoders.towers.goal_sentence import check_goal_sentence
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.metrics import START_FRAMES
@@ -167,7 +168,7 @@ class GoalFile:
 
 @dataclass(frozen=True)
 class Sentence:
-    """Description of how the object feels. Sentence encoders hardly notice a "not": say what is there.
+    """Description of how the object feels; UserError if it is negated or contradicts itself.
 
     With a baseline sentence, such as "an object", only the direction from it to the sentence counts
     (VLM-RM, arXiv 2310.12921): see `distance.embedding_distance.text_distances`.
@@ -176,6 +177,11 @@ class Sentence:
     text: str
     baseline: str = ""
     modalities: ClassVar[tuple[Modality, ...]] = ("text",)
+
+    def __post_init__(self) -> None:
+        """Check both sentences."""
+        check_goal_sentence(self.text)
+        check_goal_sentence(self.baseline)
 
     def __str__(self) -> str:
         return f"text:{self.text}" + (f"|{self.baseline}" if self.baseline else "")

@@ -100,6 +100,26 @@ def test_unknown_goal_lists_the_forms(text: str) -> None:
         parse_goal(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        ("a ball that is not soft", "hardly notices 'not'"),
+        ("Isn't it smooth?", "hardly notices 'isn't'"),
+        ("a round thing|an object without texture", "hardly notices 'without'"),
+        ("a hard, soft ball", "says both 'soft' and 'hard'"),
+        ("Rough. It feels smooth.", "says both 'smooth' and 'rough'"),
+    ],
+)
+def test_negated_and_contradictory_sentences_are_refused(text: str, cause: str) -> None:
+    with pytest.raises(UserError, match=cause):
+        parse_goal(f"text:{text}")
+
+
+@pytest.mark.parametrize("text", ["a knotted cotton net", "a hard ball, notably smooth"])
+def test_words_that_only_contain_a_negation_are_taken(text: str) -> None:
+    assert parse_goal(f"text:{text}") == Sentence(text)
+
+
 def test_each_modality_takes_the_first_goal_that_speaks_for_it() -> None:
     last, picture, words = OwnFrame(), GoalPicture(Path("a.png")), Sentence("soft")
     chosen = assign_goals([picture, last, words], ALL)
