@@ -232,6 +232,7 @@ def _policy_config(
         touch=touch.name if touch else "",
         touch_input=config.touch_input,
         touch_projection_dim=config.touch_projection_dim,
+        watches_novelty=True,
         touch_noise=config.touch_noise,
         position_noise=config.position_noise,
         end_to_end=EndToEndConfig() if config.end_to_end else None,

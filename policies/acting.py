@@ -1,5 +1,6 @@
 """Learned policy: `reset()` begins an episode, `act(observation)` returns a tick's action."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,13 +15,13 @@ from torch import Tensor
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.policies.network import ObservationBatch, PolicyNetwork
+from touchgoal.policies.network import NOVEL_SECONDS, ObservationBatch, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_images import ImageEmbedder
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.perception.state_estimation import StateEstimator
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import RefusedError, UserError
 from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskName
 from touchgoal.sim_envs.tasks import task_name
 
@@ -51,6 +52,8 @@ class LearnedPolicy:
         directory: where it was read from; None if it never was on disk.
         plan_ticks: control ticks from an observation to its plan. The next plan is requested that
             much earlier, and its actions for the ticks gone by are dropped.
+        refuses_novelty: whether `plan` raises RefusedError once touch or camera images have been unlike
+            the training for a second; set False to correct it there.
         history_ticks: number of observations that `plan` takes: the network's own, and those before
             them that the touch encoder looks back to.
     """
@@ -84,6 +87,7 @@ class LearnedPolicy:
         self._network, self.touch, self._estimator = network, touch, estimator
         self._images = ImageEmbedder(config.images) if config.images else None
         self.plan_ticks, self.directory = plan_ticks, directory
+        self.refuses_novelty = True
         self._check_delay(plan_ticks)
         self.history_ticks = config.observation_horizon + (touch.reach if touch else 0)
         self.reset()
@@ -98,6 +102,7 @@ class LearnedPolicy:
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
         self._maps: tuple[Observation, Tensor] | None = None  # the latest embedded camera images
         self._recent: list[Observation] = []
+        self._novel_plans: Counter[str] = Counter()  # in a row, by what was novel
         self._todo: list[np.ndarray] = []  # actions of the present plan
         self._next: list[np.ndarray] = []  # actions of the plan that comes next
 
@@ -131,7 +136,21 @@ class LearnedPolicy:
             touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (touch, state))
             pictures, maps = self._difference_images(history[-1]), self._feature_maps(history[-1])
             batch = ObservationBatch(touch, state, pictures, maps)
+            self._refuse_novel(batch)
             return self._network.plan(batch, self._generator)[0].numpy()
+
+    def _refuse_novel(self, batch: ObservationBatch) -> None:
+        """Raise RefusedError once something has been unlike the training for a second of plans."""
+        if not self.refuses_novelty:
+            return
+        for what, novelty in self._network.novelties(batch).items():
+            self._novel_plans[what] = self._novel_plans[what] + 1 if novelty > 1 else 0
+            ticks = self._novel_plans[what] * self.config.execution_horizon
+            if ticks >= NOVEL_SECONDS * self.config.control_hz:
+                raise RefusedError(
+                    f"for a second {what} has been unlike all of the training ({novelty:.1f} times "
+                    "as far from it as accepted): look for what has changed since the recordings"
+                )
 
     def embed(self, history: Sequence[Observation]) -> None:
         """Embed observations before `plan` needs them: most of the work."""

@@ -1,6 +1,8 @@
 """The policy's network: observations of the last ticks to actions of the next ones."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -25,12 +27,19 @@ from touchgoal.policies.heads.diffusion import (
 from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
-from touchgoal.policies.perception.frozen_images import ImageInputConfig, ImageReadout
+from touchgoal.policies.perception.frozen_images import (
+    MAP_CHANNELS,
+    ImageInputConfig,
+    ImageReadout,
+)
+from touchgoal.policies.perception.novelty import NoveltyDetector
 from touchgoal.policies.perception.proprioception import input_widths, is_position, network_input
 from touchgoal.runtime.errors import UserError
 
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
+NOVEL_SECONDS = 1.0  # s for which novelty must last to count
 _CLIP = 5.0  # standard deviations
+_TOUCH, _IMAGES = "touch", "the camera images"  # what can be novel
 
 
 @dataclass(frozen=True)
@@ -44,6 +53,7 @@ class PolicyConfig:
     # projection that is trained on the actions alone, for episodes without that truth
     touch_input: TouchInput = "wrench"
     touch_projection_dim: int = 64  # width of the projection, with "embedding"
+    watches_novelty: bool = False  # whether it notices what is unlike the training
     # standard deviation of noise on normalised embeddings in training. Without it the network
     # recognises each recorded episode by its sensors
     touch_noise: float = 0.1
@@ -157,6 +167,13 @@ class PolicyNetwork(nn.Module):
             self.end_to_end_encoder = EndToEndEncoder(config.end_to_end)
             condition_dim += len(ft.TACTILE) * config.end_to_end.width
         self.image_readout = ImageReadout(config.images) if config.images else None
+        self._novelty = nn.ModuleDict(
+            {
+                what: NoveltyDetector(dim)
+                for what, dim in self._embedding_dims().items()
+                if config.watches_novelty
+            }
+        )
         if self.image_readout:
             condition_dim += self.image_readout.width
         self.condition_dim = condition_dim
@@ -192,6 +209,36 @@ class PolicyNetwork(nn.Module):
         valid = None if action_is_pad is None else ~action_is_pad[..., None]
         chunks = to_representation(actions, joints, kind)
         self.action_normalizer.fit_range(chunks, valid, self.config.action_share)
+
+    @property
+    def detectors(self) -> dict[str, NoveltyDetector]:
+        """Detectors of novelty, by what they watch."""
+        return cast(dict[str, NoveltyDetector], dict(self._novelty))
+
+    def _embedding_dims(self) -> dict[str, int]:
+        cameras = self.config.images.cameras if self.config.images else ()
+        dims = {_TOUCH: self.config.touch_dim, _IMAGES: len(cameras) * MAP_CHANNELS}
+        return {what: dim for what, dim in dims.items() if dim}
+
+    def fit_novelty(
+        self,
+        touch: Float[Tensor, "n e"],
+        maps: Float16[Tensor, "n k c y x"] | None,
+        lengths: Sequence[int],
+    ) -> None:
+        """Learn what episodes of these lengths felt and saw."""
+        ticks = round(NOVEL_SECONDS * self.config.control_hz)
+        for what, detector in self.detectors.items():
+            detector.fit(_embedding(what, touch, maps), lengths, ticks)
+
+    @torch.inference_mode()
+    def novelties(self, batch: ObservationBatch) -> dict[str, float]:
+        """Return the novelty of the first observation's latest tick; what exceeds 1 is unknown."""
+        latest = batch.touch[:1, -1]
+        return {
+            what: detector(_embedding(what, latest, batch.maps)).item()
+            for what, detector in self.detectors.items()
+        }
 
     def loss(
         self,
@@ -264,3 +311,13 @@ class PolicyNetwork(nn.Module):
             assert batch.maps is not None, "needs the cameras' feature maps"
             parts.append(self.image_readout(batch.maps.float()))
         return torch.cat(parts, 1)
+
+
+def _embedding(
+    what: str, touch: Float[Tensor, "n e"], maps: Float16[Tensor, "n k c y x"] | None
+) -> Float[Tensor, "n e"]:
+    """Return touch, or the mean of each channel of the cameras' maps."""
+    if what == _TOUCH:
+        return touch
+    assert maps is not None, "needs the cameras' feature maps"
+    return maps.mean((-2, -1), dtype=torch.float32).flatten(1)

@@ -25,7 +25,7 @@ from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES
 from touchgoal.policies.network import ObservationBatch, PolicyNetwork
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import RefusedError, UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 
 
@@ -63,6 +63,23 @@ def test_an_actor_refuses_what_it_cannot_do() -> None:
         LearnedPolicy(policy, touch, plan_ticks=5)
     with pytest.raises(UserError, match="acts at 20 Hz, not 10"):
         LearnedPolicy(policy, touch).env_config(PickPlaceConfig(control_hz=10))
+
+
+def test_a_second_of_touch_unlike_the_training_is_refused() -> None:
+    touch = toy_touch_embedder()
+    config = replace(TOY, touch_dim=touch.dim, watches_novelty=True, execution_horizon=2)
+    windows = toy_dataset(config)
+    policy, recorded = toy_policy(config, windows).eval(), windows.recorded
+    policy.fit_novelty(recorded.touch.float(), None, recorded.lengths)
+    actor, ticks = LearnedPolicy(policy, touch), toy_observations(20)
+    for tick in ticks:  # without a limit every touch is accepted
+        actor.act(tick)
+    policy.detectors["touch"].limit.fill_(1e-3)
+    actor.reset()
+    for tick in ticks[:18]:
+        actor.act(tick)
+    with pytest.raises(RefusedError, match="a second touch has been unlike all of the training"):
+        actor.act(ticks[18])
 
 
 class SlowPolicy(LearnedPolicy):

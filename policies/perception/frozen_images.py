@@ -16,7 +16,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.perception.keypoints import keypoints
 from touchgoal.runtime.errors import UserError
 
-_CHANNELS = 112  # of `EfficientNetLite0.map`
+MAP_CHANNELS = 112  # of `EfficientNetLite0.map`
 _BATCH = 4  # images; the activations of more leave the cache
 
 
@@ -81,10 +81,10 @@ class ImageReadout(nn.Module):
     def __init__(self, config: ImageInputConfig) -> None:
         super().__init__()
         self.config = config
-        self.mean = nn.Buffer(torch.zeros(len(config.cameras), _CHANNELS, 1, 1))
-        self.std = nn.Buffer(torch.ones(len(config.cameras), _CHANNELS, 1, 1))
+        self.mean = nn.Buffer(torch.zeros(len(config.cameras), MAP_CHANNELS, 1, 1))
+        self.std = nn.Buffer(torch.ones(len(config.cameras), MAP_CHANNELS, 1, 1))
         width = config.keypoints + config.features
-        self.readouts = nn.ModuleList(nn.Conv2d(_CHANNELS, width, 1) for _ in config.cameras)
+        self.readouts = nn.ModuleList(nn.Conv2d(MAP_CHANNELS, width, 1) for _ in config.cameras)
         self.width = len(config.cameras) * config.keypoints * (2 + config.features)
 
     def fit(self, maps: Float16[Tensor, "n k c y x"]) -> None:

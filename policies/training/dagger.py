@@ -40,7 +40,10 @@ class DaggerRoles:
             network = self.policy.network()
             if network.config.estimated:
                 return LearnedPolicy(network, None, _NoisyTruth(env), env.plan_ticks), expert
-        return self.policy(env), expert
+        actor = self.policy(env)
+        if isinstance(actor, LearnedPolicy):  # what is novel is what it must learn
+            actor.refuses_novelty = False
+        return actor, expert
 
 
 def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> DaggerRoles:

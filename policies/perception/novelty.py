@@ -1,0 +1,57 @@
+"""Novelty of what a policy feels and sees: how little of it the training's variation explains."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+_COMPONENTS = 64
+_FALSE_ALARMS = 0.05  # share of episodes like the training's that may exceed the limit
+_LEAST = round(1 / _FALSE_ALARMS) - 1  # episodes from which that share can be told
+
+
+class NoveltyDetector(nn.Module):
+    """Distance of embeddings from the training's main principal components; 1 is the limit.
+
+    Jackson and Mudholkar's Q statistic (Technometrics 21, 1979). Of touch it tells a sensor that
+    sits elsewhere, swapped colours, or one finger without contact; the distance to the nearest
+    known embedding tells less. What the training shows in another place stays unnoticed.
+    """
+
+    def __init__(self, dim: int) -> None:
+        """Begin without a limit: until `fit` nothing is novel."""
+        super().__init__()
+        self.mean, self.scale = nn.Buffer(torch.zeros(dim)), nn.Buffer(torch.ones(dim))
+        self.components = nn.Buffer(torch.zeros(dim, min(dim // 2, _COMPONENTS)))
+        self.limit = nn.Buffer(torch.tensor(torch.inf))
+
+    def fit(self, embedded: Float[Tensor, "n e"], lengths: Sequence[int], ticks: int) -> None:
+        """Learn the components from every second episode, and the limit from the others.
+
+        At most one in twenty of those exceeds it for `ticks` in a row (split conformal prediction).
+        Fewer than 38 episodes are too few to tell: nothing is novel.
+        """
+        episodes = embedded.split(list(lengths))
+        learned, others = torch.cat(episodes[::2]), episodes[1::2]
+        self.mean.copy_(learned.mean(0))
+        self.scale.copy_(learned.std(0).clamp(min=1e-6))
+        _, axes = torch.linalg.eigh(((learned - self.mean) / self.scale).T.cov())
+        self.components.copy_(axes[:, -self.components.shape[1] :])
+        if len(others) >= _LEAST:
+            worst = torch.stack([_lasting(self._distance(e), ticks) for e in others]).sort().values
+            self.limit.copy_(worst[math.ceil((len(worst) + 1) * (1 - _FALSE_ALARMS)) - 1])
+
+    def forward(self, embedded: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
+        """Return the distance of embeddings, as a share of the limit."""
+        return self._distance(embedded) / self.limit
+
+    def _distance(self, embedded: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
+        scaled = (embedded - self.mean) / self.scale
+        return (scaled - scaled @ self.components @ self.components.T).norm(dim=1)
+
+
+def _lasting(distance: Float[Tensor, " t"], ticks: int) -> Float[Tensor, ""]:
+    """Return the largest distance that `ticks` in a row reach."""
+    return distance.unfold(0, min(ticks, len(distance)), 1).amin(1).amax()

@@ -1,0 +1,43 @@
+"""Novelty of embeddings: those off the training's plane."""
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from toy_policies import torch_rng
+
+from touchgoal.policies.perception.novelty import NoveltyDetector
+
+TICKS = 10
+PLANE = torch.linalg.qr(torch.randn(8, 4, generator=torch_rng()))[0].T
+
+
+def episodes(n: int, seed: int) -> torch.Tensor:
+    """Embeddings (n, 30, 8) near a plane of four dimensions, each episode at a place of its own."""
+    rng = torch_rng(seed)
+    places = torch.randn(n, 1, 4, generator=rng) + 0.3 * torch.randn(n, 30, 4, generator=rng)
+    return places @ PLANE + 0.05 * torch.randn(n, 30, 8, generator=rng)
+
+
+def fitted(training: torch.Tensor) -> NoveltyDetector:
+    detector = NoveltyDetector(8)
+    detector.fit(training.flatten(0, 1), [30] * len(training), TICKS)
+    return detector
+
+
+def novel(detector: NoveltyDetector, embedded: torch.Tensor) -> bool:
+    return bool((detector(embedded) > 1).unfold(0, TICKS, 1).all(1).any())
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.integers(0, 1000))
+def test_one_episode_in_twenty_is_novel_at_most_and_all_off_the_plane_are(seed: int) -> None:
+    detector, new = fitted(episodes(200, seed)), episodes(200, seed + 10_000)
+    assert sum(novel(detector, episode) for episode in new) <= 24  # 5 %, and four deviations
+    off = torch.randn(8, generator=torch_rng(seed))
+    off -= off @ PLANE.T @ PLANE
+    assert all(novel(detector, episode + off / off.norm()) for episode in new)
+
+
+def test_few_episodes_set_no_limit() -> None:
+    assert fitted(episodes(37, 0))(torch.full((1, 8), 100.0)) == 0
+    assert fitted(episodes(38, 0))(torch.full((1, 8), 100.0)) > 1
