@@ -30,6 +30,11 @@ def fewest_and_most(metrics: Metrics) -> str:
     return f"worst {worst}, best {best}"
 
 
+def each_row(metrics: Metrics) -> str:
+    """Success of every row."""
+    return "; ".join(str(_rate(row["trials"])) for row in metrics["rows"])
+
+
 def maze(metrics: Metrics, **names: str) -> str:
     """Success of closed-loop rows, by label and a part of the row's name."""
     found = []
