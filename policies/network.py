@@ -315,7 +315,7 @@ class PolicyNetwork(nn.Module):
 
 def _embedding(
     what: str, touch: Float[Tensor, "n e"], maps: Float16[Tensor, "n k c y x"] | None
-) -> Float[Tensor, "n e"]:
+) -> Float[Tensor, "n d"]:
     """Return touch, or the mean of each channel of the cameras' maps."""
     if what == _TOUCH:
         return touch
