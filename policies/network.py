@@ -39,7 +39,7 @@ from touchgoal.runtime.errors import UserError
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
 NOVEL_SECONDS = 1.0  # s for which novelty must last to count
 _CLIP = 5.0  # standard deviations
-_TOUCH, _IMAGES = "touch", "the camera images"  # what can be novel
+_TOUCH, _SIGHT = "touch", "sight"  # what can be novel
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class PolicyConfig:
     # projection that is trained on the actions alone, for episodes without that truth
     touch_input: TouchInput = "wrench"
     touch_projection_dim: int = 64  # width of the projection, with "embedding"
-    watches_novelty: bool = False  # whether it notices what is unlike the training
+    watches_novelty: bool = False  # whether it has detectors of novelty, see `novelties`
     # standard deviation of noise on normalised embeddings in training. Without it the network
     # recognises each recorded episode by its sensors
     touch_noise: float = 0.1
@@ -217,7 +217,7 @@ class PolicyNetwork(nn.Module):
 
     def _embedding_dims(self) -> dict[str, int]:
         cameras = self.config.images.cameras if self.config.images else ()
-        dims = {_TOUCH: self.config.touch_dim, _IMAGES: len(cameras) * MAP_CHANNELS}
+        dims = {_TOUCH: self.config.touch_dim, _SIGHT: len(cameras) * MAP_CHANNELS}
         return {what: dim for what, dim in dims.items() if dim}
 
     def fit_novelty(
@@ -226,7 +226,7 @@ class PolicyNetwork(nn.Module):
         maps: Float16[Tensor, "n k c y x"] | None,
         lengths: Sequence[int],
     ) -> None:
-        """Learn what episodes of these lengths felt and saw."""
+        """Fit the detectors of novelty to the ticks of episodes of these lengths."""
         ticks = round(NOVEL_SECONDS * self.config.control_hz)
         for what, detector in self.detectors.items():
             detector.fit(_embedding(what, touch, maps), lengths, ticks)

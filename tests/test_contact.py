@@ -81,7 +81,7 @@ def test_what_a_long_contact_leaves_behind_is_no_contact() -> None:
 
 
 def test_a_stream_that_starts_with_one_frame_learns_its_noise() -> None:
-    """As deployed: an untouched frame, repeated at first, then the noise of JPEG and drifting light."""
+    """The first JPEG is read several times; later ones differ by compression and drifting light."""
     light = 1 + 0.002 * np.arange(80)
     height = np.zeros(80)
     height[50:70] = 25

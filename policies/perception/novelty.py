@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 _COMPONENTS = 64
 _FALSE_ALARMS = 0.05  # share of episodes like the training's that may exceed the limit
-_LEAST = round(1 / _FALSE_ALARMS) - 1  # episodes from which that share can be told
+_LEAST = round(1 / _FALSE_ALARMS) - 1  # fewest held-out episodes that bound that share
 
 
 class NoveltyDetector(nn.Module):
