@@ -30,9 +30,12 @@ def novel(detector: NoveltyDetector, embedded: torch.Tensor) -> bool:
 
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 1000))
-def test_one_episode_in_twenty_is_novel_at_most_and_all_off_the_plane_are(seed: int) -> None:
-    detector, new = fitted(episodes(200, seed)), episodes(200, seed + 10_000)
-    assert sum(novel(detector, episode) for episode in new) <= 24  # 5 %, and four deviations
+def test_few_episodes_like_the_training_are_novel_and_all_off_the_plane_are(seed: int) -> None:
+    training, new = episodes(200, seed), episodes(200, seed + 10_000)
+    detector = fitted(training)
+    assert sum(novel(detector, episode) for episode in training[1::2]) == 4  # (100 + 1) 5 % - 1
+    # The limit's own share varies as Beta(5, 96): above a fifth once in 10^5 trainings.
+    assert sum(novel(detector, episode) for episode in new) <= 60
     off = torch.randn(8, generator=torch_rng(seed))
     off -= off @ PLANE.T @ PLANE
     assert all(novel(detector, episode + off / off.norm()) for episode in new)
