@@ -157,6 +157,8 @@ def test_wrenches_and_slip_are_mujocos() -> None:
     assert max(pad.slip_speed for pad in env.pad_contacts()) > 1e-3  # m/s
     # The wire touches no more of the robot than its bead.
     np.testing.assert_allclose(env.external_wrench(), external, atol=1e-9)
+    np.testing.assert_allclose(env.contact_force(), external[:3], atol=1e-9)
+    assert env.contact_force().any()
 
 
 def _velocity(env: BeadMaze, geom: int, point: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ from touchgoal.sim_envs.config import BeadMazeConfig, FragileCarryConfig, Outcom
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE, SHAPES
+from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
 
 ENVS = ["touchgoal/PickPlace-v0", "touchgoal/BeadMaze-v0", "touchgoal/FragileCarry-v0"]
@@ -125,6 +126,25 @@ def test_expert_is_recorded_on_every_arm(config: TaskConfig, arm: Literal["fr3",
     episode.check()
     for key in (ft.STATE, ft.ACTION):
         assert episode.frames[key].shape[1:] == ft.features_of(env.n_joints)[key].shape
+
+
+def test_full_meshes_show_the_arm_of_the_fast_ones_and_leave_physics_alone() -> None:
+    silhouettes, states = [], []
+    for meshes in ("fast", "full"):
+        env = PickPlace(replace(BLIND, meshes=meshes))
+        env.reset(seed=3)
+        renderer = open_renderer(env.model, 240, 320)
+        renderer.enable_segmentation_rendering()
+        renderer.update_scene(env.data, "side")
+        shown = renderer.render()[..., 0]
+        robot = np.append(env.model.body_rootid[env.model.geom_bodyid] == 1, False)
+        silhouettes.append(robot[shown])
+        states.append(env.step(np.append(np.full(7, 0.01), 0.04))[0][ft.STATE])
+        renderer.close()
+        env.close()
+    fast, full = silhouettes
+    assert (fast & full).sum() > 0.95 * (fast | full).sum() > 1000
+    np.testing.assert_array_equal(*states)
 
 
 @pytest.mark.parametrize("shape", SHAPES)

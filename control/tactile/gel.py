@@ -39,18 +39,24 @@ def deform(overlap: Map, pitch: float, blur_sigmas: tuple[float, ...]) -> Map:
     h, w = overlap.shape
     scale = pixels_per_cell(pitch)
     low = cv2.resize(overlap, (w // scale, h // scale), interpolation=cv2.INTER_AREA)
-    around = 2 * NEARBY_CELLS + 1
-    contact = low > CONTACT_SHARE * cv2.dilate(low, np.ones((around, around), np.uint8))
+    contact = _contact(low)
     smooth = low
     for sigma in blur_sigmas:
-        blurred = cv2.GaussianBlur(smooth, (0, 0), sigma / (pitch * scale))
-        smooth = np.where(contact, low, blurred)
+        smooth = cv2.GaussianBlur(smooth, (0, 0), sigma / (pitch * scale))
+        cv2.copyTo(low, contact, smooth)
     smooth = cv2.GaussianBlur(smooth, (5, 5), 0)  # the constraint's edge is no edge of the gel
     soft = cv2.GaussianBlur(contact.astype(np.float32), (5, 5), 0)
     smooth, low, soft = (
         cv2.resize(a, (w, h), interpolation=cv2.INTER_LINEAR) for a in (smooth, low, soft)
     )
     return cv2.GaussianBlur(smooth + soft * (overlap - low), (3, 3), 0)
+
+
+def _contact(overlap: Map) -> UInt8[np.ndarray, "h w"]:
+    """Return 1 where the gel touches the object, 0 elsewhere."""
+    around = 2 * NEARBY_CELLS + 1
+    nearby = cv2.dilate(overlap, np.ones((around, around), np.uint8))
+    return (overlap > CONTACT_SHARE * nearby).view(np.uint8)
 
 
 def shadow_depth(

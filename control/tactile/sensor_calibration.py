@@ -104,17 +104,23 @@ def monomials(
     return np.stack([x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y])
 
 
-def shadows(
+def shadow_depth(
     calibration: SensorCalibration, surface: Map, pitch: float
 ) -> Float32[np.ndarray, "lights h w"]:
-    """Return the share of each light's full shadow, 0 to 1, on a surface (m) of a pitch (m/px).
+    """Return `gel.shadow_depth` (m) of a surface (m) of a pitch (m/px) for a sensor's lights.
 
     A depth beyond `max_depth` counts as `max_depth`.
     """
-    known = np.minimum(surface, np.float32(calibration.max_depth))
-    depth = gel.shadow_depth(known, pitch, calibration.light_azimuths, calibration.shadow_slope)
-    depth /= depth + np.float32(calibration.penumbra)
-    return depth
+    _, known = cv2.threshold(surface, calibration.max_depth, 0, cv2.THRESH_TRUNC)
+    return gel.shadow_depth(known, pitch, calibration.light_azimuths, calibration.shadow_slope)
+
+
+def shadows(
+    calibration: SensorCalibration, surface: Map, pitch: float
+) -> Float32[np.ndarray, "lights h w"]:
+    """Return the share of each light's full shadow, 0 to 1, on a surface (m) of a pitch (m/px)."""
+    depth = shadow_depth(calibration, surface, pitch)
+    return depth / (depth + np.float32(calibration.penumbra))
 
 
 def design_matrix(

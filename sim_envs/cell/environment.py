@@ -268,9 +268,9 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         start = self.command
         limits = self.model.actuator_ctrlrange[: self.n_joints]
         self.command = np.clip(start + delta, limits[:, 0], limits[:, 1])
-        for k in range(1, setpoints + 1):
-            joints = start + (self.command - start) * (k / setpoints)
-            self.step_physics(joints, width, self.robot.tool.speed, steps)
+        speed = self.robot.tool.speed
+        for joints in np.linspace(start, self.command, setpoints + 1)[1:]:
+            self.step_physics(joints, width, speed, steps)
             if self.monitor_force(SETPOINT_PERIOD):
                 break
         self.update_contacts()

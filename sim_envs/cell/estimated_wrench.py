@@ -1,5 +1,6 @@
 """The force on the hand as a real arm estimates it from joint torques, and its ceiling."""
 
+import math
 from functools import cache
 
 import numpy as np
@@ -61,15 +62,18 @@ class ForceMonitor:
     def reset(self) -> None:
         """Begin an episode."""
         # exceeded: whether it has been above the ceiling in this episode
-        self._filtered, self.exceeded = np.zeros(3), False
+        self._filtered, self.exceeded = [0.0, 0.0, 0.0], False
 
     def update(self, force: Float[np.ndarray, "3"], seconds: float) -> None:
         """Take the true force (N), `seconds` after the last one."""
-        self._filtered += (1 - _decay(seconds, _LAG)) * (force - self._filtered)
-        self.check(self._filtered)
+        share = 1 - _decay(seconds, _LAG)
+        # Every 2 ms: on three numbers plain Python takes a fifth of NumPy's time.
+        pairs = zip(self._filtered, force.tolist(), strict=True)
+        self._filtered = [old + share * (new - old) for old, new in pairs]
+        self.exceeded |= math.hypot(*self._filtered) > self._ceiling
 
-    def check(self, wrench: Float[np.ndarray, " n"]) -> None:
-        """Compare a force, or the force of a wrench, with the ceiling (N)."""
+    def check(self, wrench: Wrench) -> None:
+        """Compare the force of a wrench with the ceiling (N)."""
         self.exceeded |= bool(np.linalg.norm(wrench[:3]) > self._ceiling)
 
 

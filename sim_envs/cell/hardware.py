@@ -25,6 +25,7 @@ GRIPPER_SPEED = FRANKA_HAND.speed  # m/s of width
 _FINGER_LAG = 1e-3  # m by which a freely moving finger lags its set-point, at most
 
 _RENDERERS = 2  # OpenGL contexts that are kept
+_NO_FORCE = np.zeros(3)
 _LEAST_TORQUE = 2.0  # Nm; 20 N on the hand over the table, from any side, load some joint with more
 
 
@@ -59,14 +60,15 @@ class SimulatedHardware(ABC):
         The gripper goes to `width` (m) at `speed` (m/s of width), pressing with `grasp_force` at
         most.
         """
-        travel = speed / 2 * steps * self.model.opt.timestep  # m of one finger
-        self._finger_target += min(max(width / 2 - self._finger_target, -travel), travel)
+        travel = speed / 2 * steps * self._timestep  # m of one finger
+        target = self._finger_target
+        target += min(max(width / 2 - target, -travel), travel)
         # No wind-up while an object holds the fingers open: it would delay letting go.
         deepest = self.width() / 2 - 2 * self.grasp_force / self._finger_stiffness - _FINGER_LAG
-        self._finger_target = max(self._finger_target, deepest)
-        self.model.actuator_forcerange[self._gripper, 0] = -2 * self.grasp_force
-        self.data.ctrl[: self.n_joints] = joints
-        self.data.ctrl[self._gripper] = self._finger_target
+        self._finger_target = max(target, deepest)
+        self._gripper_force[0] = -2 * self.grasp_force
+        self._arm_control[:] = joints
+        self._gripper_control[0] = self._finger_target
         mujoco.mj_step(self.model, self.data, nstep=steps)
 
     def update_contacts(self) -> None:
@@ -84,9 +86,7 @@ class SimulatedHardware(ABC):
 
     def width(self) -> float:
         """Return the gripper's width, m."""
-        left, right = self._fingers
-        positions = self.data.qpos
-        return float(positions[left] + positions[right])
+        return sum(self._finger_positions.tolist())
 
     def width_target(self) -> float:
         """Return the width that the gripper was sent to, m."""
@@ -102,10 +102,9 @@ class SimulatedHardware(ABC):
         Reading contacts takes as long as a physics step, so they are read only if the torque on some
         joint exceeds `_LEAST_TORQUE`.
         """
-        if np.abs(self.data.qfrc_constraint[self.arm_dofs]).max() < _LEAST_TORQUE:
-            return np.zeros(3)
-        _, wrench = self._reader.read(self.data)
-        return wrench[:3]
+        if max(map(abs, self._constraint_torque.tolist())) < _LEAST_TORQUE:
+            return _NO_FORCE
+        return self._reader.external_force(self.data)
 
     def pad_contacts(self) -> tuple[PadContact, PadContact]:
         """Return the exact wrench and slip of both pads at the last `update_contacts`."""
@@ -188,8 +187,17 @@ class SimulatedHardware(ABC):
         self.arm_positions = np.array([joint.qposadr[0] for joint in joints])
         self.arm_dofs = np.array([joint.dofadr[0] for joint in joints])
         self._fingers = [model.joint(f"finger_joint{i}").qposadr[0] for i in (1, 2)]
-        self._gripper = model.actuator("gripper").id
-        self._finger_stiffness = float(model.actuator_gainprm[self._gripper, 0])
+        gripper = model.actuator("gripper").id
+        self._finger_stiffness = float(model.actuator_gainprm[gripper, 0])
+        self._timestep = model.opt.timestep
+        # Views, for what every set-point reads or writes.
+        self._gripper_force = model.actuator_forcerange[gripper]
+        self._arm_control = self.data.ctrl[: self.n_joints]
+        self._gripper_control = self.data.ctrl[gripper : gripper + 1]
+        left, right = self._fingers
+        self._finger_positions = self.data.qpos[left : right + 1 : right - left]
+        first = self.arm_dofs[0]
+        self._constraint_torque = self.data.qfrc_constraint[first : first + self.n_joints]
         self._tcp = model.site("tcp").id
         self._reader = ContactReader(model)
         self.tactile_frames: list[TactileFrame] = []

@@ -17,11 +17,14 @@ from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import MAX_CAMERA_SIDE, CameraPlacement, SceneConfig
+from touchgoal.sim_envs.scene.merged_corners import merge_corners
 from touchgoal.sim_envs.scene.objects import FIRM, Body
 
 SIDES = ("left", "right")
 OBJECT_GROUP, VISUAL_GROUP, HIDDEN_GROUP = 1, 2, 3
 GRIPPER_MAX_FORCE = 80.0  # N, both fingers; opening never needs a limit below it
+
+_DETAIL = 2e-3  # m: cubes in which corners of the full meshes are merged
 
 _UR5E = Path(__file__).with_name("ur5e.xml")
 ROBOTS = {"fr3": limits.FR3, "ur5e": limits.UR5E}
@@ -97,7 +100,7 @@ def set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     visual.headlight.ambient = np.full(3, 0.3, np.float32)
     visual.headlight.diffuse = np.full(3, 0.3, np.float32)
     visual.headlight.specular = np.zeros(3, np.float32)
-    visual.quality.shadowsize = 0 if config.meshes == "fast" else 2048
+    visual.quality.shadowsize = 0 if config.meshes == "fast" else 1024
     visual.quality.offsamples = 0 if config.meshes == "fast" else 4
     visual.quality.numslices = 24
 
@@ -123,6 +126,8 @@ def _strip(spec: mujoco.MjSpec, fast: bool) -> None:
     used = {geom.meshname for body in spec.bodies for geom in body.geoms}
     for mesh in [m for m in spec.meshes if m.name not in used]:
         spec.delete(mesh)
+    if not fast:
+        merge_corners(spec, {name for name in used if not name.endswith("_coll")}, _DETAIL)
 
 
 def _compensate_gravity(body: mujoco.MjsBody) -> None:

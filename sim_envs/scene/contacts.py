@@ -43,9 +43,9 @@ class ContactReader:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
+        self._pads = {model.geom(f"{side}_pad").id: i for i, side in enumerate(SIDES)}
         self._pad_of = np.full(model.ngeom, -1)  # by geom: 0 left, 1 right, -1 none
-        for i, side in enumerate(SIDES):
-            self._pad_of[model.geom(f"{side}_pad").id] = i
+        self._pad_of[list(self._pads)] = list(self._pads.values())
         self._sensors = [model.site(f"{side}_sensor").id for side in SIDES]
         self._tcp = model.site("tcp").id
         base = model.body("base").id
@@ -60,27 +60,35 @@ class ContactReader:
         The wrench is in the base frame.
         """
         contacts, model = data.contact, self._model
-        pads = self._pad_of[contacts.geom]
+        geoms, addresses = contacts.geom, contacts.efc_address
         wrenches, slip = _read_contacts(
-            Contacts(
-                contacts.geom, contacts.frame, contacts.pos, contacts.efc_address, contacts.dim
-            ),
+            Contacts(geoms, contacts.frame, contacts.pos, addresses, contacts.dim),
             data.efc_force,
             self._is_robot,
-            pads,
+            self._pad_of,
             data.site_xpos[[*self._sensors, self._tcp]],
             BodyMotion(model.geom_bodyid, model.body_rootid, data.cvel, data.subtree_com),
         )
-        solved = contacts.efc_address >= 0
+        touching: tuple[set[int], set[int]] = set(), set()
+        for pair, address in zip(geoms.tolist(), addresses.tolist(), strict=True):
+            for geom, other in (pair, pair[::-1]):
+                if address >= 0 and geom in self._pads:
+                    touching[self._pads[geom]].add(other)
 
         def pad(side: int) -> PadContact:
-            force, torque = wrenches[side].reshape(2, 3) @ data.site_xmat[
-                self._sensors[side]
-            ].reshape(3, 3)
-            touching = contacts.geom[:, ::-1][(pads == side) & solved[:, None]]
-            return PadContact(force, torque, float(slip[side]), frozenset(touching.tolist()))
+            axes = data.site_xmat[self._sensors[side]].reshape(3, 3)
+            force, torque = wrenches[side].reshape(2, 3) @ axes
+            return PadContact(force, torque, float(slip[side]), frozenset(touching[side]))
 
         return (pad(0), pad(1)), wrenches[2]
+
+    def external_force(self, data: mujoco.MjData) -> Float[np.ndarray, "3"]:
+        """Return the force (N, base frame) of `read`'s external wrench, in a fraction of its time."""
+        contacts = data.contact
+        frames, addresses, sizes = contacts.frame, contacts.efc_address, contacts.dim
+        return _external_force(
+            contacts.geom, frames, addresses, sizes, data.efc_force, self._is_robot
+        )
 
     def joint_torque(self, data: mujoco.MjData) -> Float[np.ndarray, " nv"]:
         """Return the generalised force of all contacts, J^T f; internal forces cancel."""
@@ -125,7 +133,7 @@ class BodyMotion(NamedTuple):
 
 @njit(cache=True)
 @no_type_check
-def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
+def _read_contacts(contacts, forces, is_robot, pad_of, origins, moving):
     """Return wrenches (N, Nm, world frame) on pads and robot about their origins, and slip (m/s)."""
     wrenches, slip = np.zeros((3, 6)), np.zeros(2)
     for i in range(contacts.addresses.size):
@@ -143,7 +151,7 @@ def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
             sign = 1.0 if is_robot[second] else -1.0
             _add_wrench(wrenches[2], sign, force, torque, point - origins[2])
         for k in range(2):
-            side = pads[i, k]
+            side = pad_of[contacts.geoms[i, k]]
             if side < 0:
                 continue
             _add_wrench(wrenches[side], 2.0 * k - 1.0, force, torque, point - origins[side])
@@ -152,6 +160,20 @@ def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
             relative -= normal * (normal * relative).sum()
             slip[side] = max(slip[side], np.sqrt((relative**2).sum()))
     return wrenches, slip
+
+
+@njit(cache=True)
+@no_type_check
+def _external_force(geoms, frames, addresses, sizes, forces, is_robot):
+    total = np.zeros(3)
+    for i in range(addresses.size):
+        on_first, on_second = is_robot[geoms[i, 0]], is_robot[geoms[i, 1]]
+        if addresses[i] < 0 or on_first == on_second:
+            continue
+        sign = 1.0 if on_second else -1.0
+        for k in range(min(sizes[i], 3)):
+            total += sign * forces[addresses[i] + k] * frames[i, 3 * k : 3 * k + 3]
+    return total
 
 
 @njit(inline="always")

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numba import njit
 
-from touchgoal.control.tactile.sensor_calibration import shadows
+from touchgoal.control.tactile.sensor_calibration import shadow_depth
 from touchgoal.sim_envs.tactile.sensor_instance import COUNT_STEP, NOISE_MARGIN, SensorInstance
 
 HeightField = Float32[np.ndarray, "h w"]
@@ -20,10 +20,8 @@ HeightField = Float32[np.ndarray, "h w"]
 @no_type_check
 def _response(x, y, depth, k):
     """Evaluate the response to a normal and a depth (`sensor_calibration.shape_features`)."""
-    xx, xy, yy = x * x, x * y, y * y
-    linear = k[0] * x + k[1] * y + k[9] * depth
-    quadratic = k[2] * xx + k[3] * xy + k[4] * yy
-    return linear + quadratic + x * (k[5] * xx + k[6] * xy + k[7] * yy) + k[8] * y * yy
+    along = k[0] + x * (k[2] + k[5] * x + k[6] * y) + y * (k[3] + k[7] * y)
+    return x * along + y * (k[1] + y * (k[4] + k[8] * y)) + k[9] * depth
 
 
 @njit(inline="always")
@@ -46,7 +44,7 @@ def _along(k, slope, v):
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 @no_type_check
-def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
+def _colours(surface, per_pitch, response, limits, depths, penumbra, shadow, gain, out):
     """Compute `sensor_calibration.shade` less the background, at half its resolution, planar."""
     h, w = surface.shape
     half, one, zero = np.float32(0.5), np.float32(1.0), np.float32(0.0)
@@ -56,17 +54,26 @@ def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
     flattest = one / (max_slope * max_slope)
     squares, down = response.shape[2] > 3, np.empty(10, np.float32)
     nx, ny, pressed = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    d0, d1, d2 = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    wide = np.empty(w + 2, np.float32)
+    left, right = wide[:w], wide[2:]
     for i in range(h):
         row, above, below = surface[i], surface[max(i - 1, 0)], surface[min(i + 1, h - 1)]
+        wide[1 : w + 1] = row
+        wide[0], wide[w + 1] = row[0], row[w - 1]
         for j in range(w):
-            gx = (row[min(j + 1, w - 1)] - row[max(j - 1, 0)]) * scale
+            gx = (right[j] - left[j]) * scale
             gy = (below[j] - above[j]) * scale
             square = gx * gx + gy * gy
             inverse = -one / np.sqrt(max(one + square, square * flattest))
             nx[j], ny[j] = gx * inverse, gy * inverse
             pressed[j] = min(row[j], max_depth)
         v = np.float32((4 * i + 1) / (2 * h - 1) - 1)
-        d0, d1, d2 = dark[0, i], dark[1, i], dark[2, i]
+        z0, z1, z2 = depths[0, i], depths[1, i], depths[2, i]
+        for j in range(w):
+            d0[j] = z0[j] / (z0[j] + penumbra)
+            d1[j] = z1[j] / (z1[j] + penumbra)
+            d2[j] = z2[j] / (z2[j] + penumbra)
         for c in range(3):
             for k in range(10):
                 down[k] = response[c, k, 2]
@@ -97,7 +104,8 @@ def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.
         np.float32(1 / pitch),
         calibration.response,
         tuple(np.float32(a) for a in limits),
-        shadows(calibration, surface, pitch),
+        shadow_depth(calibration, surface, pitch),
+        np.float32(calibration.penumbra),
         calibration.shadow,
         instance.illumination,
         change,

@@ -1,7 +1,8 @@
 """The simulated fingertip sensor: its image, depth and forces for the present scene."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 
 import cv2
 import mujoco
@@ -26,6 +27,7 @@ _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 # Surfaces at half the image's resolution: between two of its rays a 20 mm ball deviates from a
 # straight line by 0.09 um. The force balance, over the whole gel, needs a quarter.
 _FINE, _COARSE = 2, 4
+AddGeom = Callable[[HeightField, float], None]  # raises a height field of a pitch (m) to a geom
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,10 @@ class TactilePad:
         touched = self._touched(contact)
         if not touched or contact.normal_force <= 0:
             return self._untouched(rng)
-        press = self._press(data, contact, touched)
-        overlap = reduce(np.maximum, (self._overlap(data, press, body) for body in touched))
+        placed = [self._placed(data, body) for body in touched]
+        press = self._press(placed, contact, touched)
+        overlaps = (self._overlap(data, press, *body) for body in zip(touched, placed, strict=True))
+        overlap = reduce(np.maximum, overlaps)
         # The solver's coefficient: the object's, which has priority over the gel's.
         friction = max(float(self._model.geom_friction[geom, 0]) for geom in contact.geoms)
         self._field = force_field(press, self._field, contact, friction, self._sensor)
@@ -126,33 +130,38 @@ class TactilePad:
     def _modulus(self, material: Material) -> float:
         return 1 / (1 / self._sensor.foundation_modulus + 1 / material.foundation_modulus)
 
-    def _press(self, data: mujoco.MjData, contact: PadContact, touched: list[int]) -> Press:
-        height = reduce(np.maximum, (self._height(data, b, self._gel_grid) for b in touched))
+    def _press(self, placed: list[list[AddGeom]], contact: PadContact, touched: list[int]) -> Press:
+        height = reduce(np.maximum, (_height(geoms, self._gel_grid) for geoms in placed))
         modulus = min(self._modulus(self._materials[body]) for body in touched)
         return press_until_balanced(height, self._gel_grid.pitch, contact, modulus, self._sensor)
 
-    def _overlap(self, data: mujoco.MjData, press: Press, body: int) -> HeightField:
+    def _overlap(
+        self, data: mujoco.MjData, press: Press, body: int, geoms: list[AddGeom]
+    ) -> HeightField:
         grid, material = self._image_grid, self._materials[body]
-        height = self._height(data, body, grid)
+        height = _height(geoms, grid)
         press.push_in(height, grid.pitch)
-        position, rotation = self._pose(data, data.xpos[body], data.xmat[body])
-        add_texture(height, grid.pitch, material, position - [0, 0, press.shift], rotation)
-        share = self._modulus(material) / self._sensor.foundation_modulus
-        np.maximum(height, 0, out=height)
-        height *= np.float32(share)
+        if material.texture:
+            position, rotation = self._pose(data, data.xpos[body], data.xmat[body])
+            add_texture(height, grid.pitch, material, position - [0, 0, press.shift], rotation)
+        cv2.threshold(height, 0, 0, cv2.THRESH_TOZERO, dst=height)
+        height *= np.float32(self._modulus(material) / self._sensor.foundation_modulus)
         return height
 
-    def _height(self, data: mujoco.MjData, body: int, grid: Grid) -> HeightField:
-        """Return one body's height field before it is pushed into the gel, m."""
-        height, model = grid.empty(), self._model
+    def _placed(self, data: mujoco.MjData, body: int) -> list[AddGeom]:
+        """Return for each geom of a body what raises a height field of some pitch to it."""
+        placed: list[AddGeom] = []
         for geom in self._geoms[body]:
-            pose = self._pose(data, data.geom_xpos[geom], data.geom_xmat[geom])
+            position, rotation = self._pose(data, data.geom_xpos[geom], data.geom_xmat[geom])
             if geom in self._meshes:
-                add_mesh(height, grid.pitch, *self._meshes[geom], *pose)
+                vertices, faces = self._meshes[geom]
+                add = partial(add_mesh, vertices=vertices, faces=faces)
             else:
-                kind, size = int(model.geom_type[geom]), model.geom_size[geom]
-                add_primitive(height, grid.pitch, kind, *pose, size)
-        return height
+                kind, size = int(self._model.geom_type[geom]), self._model.geom_size[geom]
+                add = partial(add_primitive, kind=kind, size=size)
+            pose = position.astype(np.float32), rotation.astype(np.float32)
+            placed.append(partial(add, position=pose[0], rotation=pose[1]))
+        return placed
 
     def _pose(
         self,
@@ -162,6 +171,14 @@ class TactilePad:
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
         R = data.site_xmat[self._site].reshape(3, 3)
         return (position - data.site_xpos[self._site]) @ R, R.T @ matrix.reshape(3, 3)
+
+
+def _height(geoms: list[AddGeom], grid: Grid) -> HeightField:
+    """Return one body's height field before it is pushed into the gel, m."""
+    height = grid.empty()
+    for add in geoms:
+        add(height, grid.pitch)
+    return height
 
 
 def _solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:

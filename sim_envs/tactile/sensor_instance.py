@@ -1,12 +1,15 @@
 """Differences between two sensors of one model."""
 
+import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
+from typing import no_type_check
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int8, Int16, Shaped, UInt8
+from numba import njit
 
 from touchgoal.control.tactile.sensor_calibration import (
     SensorCalibration,
@@ -20,6 +23,7 @@ from touchgoal.sim_envs.tactile.markers import draw, rest_positions
 
 NOISE_MARGIN = 64  # px by which the noise tile is larger than a frame
 COUNT_STEP = 1 / 16  # counts: fine enough, and small enough numbers for the processor's cache
+_SHARED, _OWN = math.sqrt(0.3), math.sqrt(0.7)  # of the noise, by all channels and by one
 
 
 @dataclass(frozen=True)
@@ -73,20 +77,44 @@ def sample_instance(
     )
     h, w = sensor.image_shape
     smooth = cv2.resize(rng.normal(0, 1, (4, 5, 3)), (w, h), interpolation=cv2.INTER_CUBIC)
-    background = typical.background * brightness
-    background += randomization.offset * rng.normal(size=3) + randomization.pattern * smooth
-    tile = (h + NOISE_MARGIN, w + NOISE_MARGIN, 3)
-    common = np.sqrt(0.3)  # 0.3 of the noise variance is the same in all channels
-    noise = common * rng.normal(size=(*tile[:2], 1)) + np.sqrt(0.7) * rng.normal(size=tile)
+    offset, background = randomization.offset * rng.normal(size=3), np.empty((3, h, w), np.int16)
+    _tint(typical.background, brightness, offset, randomization.pattern, smooth, background)
+    tile = h + NOISE_MARGIN, w + NOISE_MARGIN
+    shared, own = rng.standard_normal(tile), rng.standard_normal((*tile, 3))
+    noise = np.empty((3, *tile), np.int8)
+    _mix(shared, own, typical.noise / COUNT_STEP, noise)
     markers, radius = _markers(sensor, pitch, randomization.markers, rng)
     return SensorInstance(
         calibration,
-        _planar(background / COUNT_STEP, np.int16),
+        background,
         light,
-        _planar(np.clip(typical.noise / COUNT_STEP * noise, -127, 127), np.int8),
+        noise,
         markers,
         radius,
     )
+
+
+@njit(cache=True)
+@no_type_check
+def _tint(background, brightness, offset, pattern, smooth, out):
+    """Write a background of other lights and an uneven gel to planes, in units of COUNT_STEP."""
+    for i in range(out.shape[1]):
+        for j in range(out.shape[2]):
+            for c in range(3):
+                counts = background[i, j, c] * brightness[c]
+                counts += offset[c] + pattern * smooth[i, j, c]
+                out[c, i, j] = np.int16(counts / COUNT_STEP)
+
+
+@njit(cache=True)
+@no_type_check
+def _mix(shared, own, size, out):
+    """Write noise of a size to planes: 0.3 of its variance is the same in all channels."""
+    for i in range(shared.shape[0]):
+        for j in range(shared.shape[1]):
+            for c in range(3):
+                value = size * (_SHARED * shared[i, j] + _OWN * own[i, j, c])
+                out[c, i, j] = np.int8(min(max(value, -127.0), 127.0))
 
 
 def _typical(sensor: SensorModel) -> tuple[SensorCalibration, Float32[np.ndarray, "3 h3 w3"]]:
@@ -114,14 +142,19 @@ def _turned(
     response: Float32[np.ndarray, "3 k 3"], turns: Float[np.ndarray, "3"]
 ) -> Float32[np.ndarray, "3 k 3"]:
     """Turn the lights of a response about the sensor's axis, rad from x towards y (exactly)."""
-    x, y = np.random.default_rng(0).uniform(-1, 1, (2, 64))
-    basis = monomials(x, y).T
-    n = basis.shape[1]
+    x, y, inverse = _normals()
     turned = response.copy()
     for channel, c, s in zip(turned, np.cos(turns), np.sin(turns), strict=True):
-        rotated = monomials(x * c + y * s, y * c - x * s).T @ channel[:n]
-        channel[:n] = np.linalg.lstsq(basis, rotated, rcond=None)[0]
+        rotated = monomials(x * c + y * s, y * c - x * s)
+        channel[: len(inverse)] = inverse @ (rotated.T @ channel[: len(inverse)])
     return turned
+
+
+@cache
+def _normals() -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "9 n"]]:
+    """Return x and y of some normals, and what fits `monomials` to values at them."""
+    x, y = np.random.default_rng(0).uniform(-1, 1, (2, 64))
+    return x, y, np.linalg.pinv(monomials(x, y).T)
 
 
 def _markers(
