@@ -5,7 +5,6 @@ They are computed at half the image's resolution and blended onto background and
 
 from typing import no_type_check
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 from numba import njit
@@ -116,16 +115,18 @@ def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.
 @njit(cache=True, fastmath=True, error_model="numpy")
 @no_type_check
 def _blend(change, background, noise, oy, ox, out):
-    """Double the change bilinearly, add background and noise, clip to bytes."""
+    """Double the change bilinearly, add background and noise, clip to bytes, RGB in turn."""
     _, h, w = change.shape
     near, far = np.float32(0.75), np.float32(0.25)
     zero, half, full = np.float32(0.0), np.float32(0.5), np.float32(255.0)
     step = np.float32(COUNT_STEP)
     coarse, fine = np.empty(w + 2, np.float32), np.empty(2 * w, np.float32)
-    for c in range(3):
-        for i in range(2 * h):
-            k = i >> 1
-            beside = min(max(k + (1 if i & 1 else -1), 0), h - 1)
+    planes = np.empty((3, 2 * w), np.uint8)
+    red, green, blue = planes[0], planes[1], planes[2]
+    for i in range(2 * h):
+        k = i >> 1
+        beside = min(max(k + (1 if i & 1 else -1), 0), h - 1)
+        for c in range(3):
             a, b = change[c, k], change[c, beside]
             for j in range(w):
                 coarse[j + 1] = near * a[j] + far * b[j]
@@ -134,29 +135,34 @@ def _blend(change, background, noise, oy, ox, out):
                 fine[2 * j] = near * coarse[j + 1] + far * coarse[j]
                 fine[2 * j + 1] = near * coarse[j + 1] + far * coarse[j + 2]
             base, grain = background[c, i], noise[c, i + oy, ox : ox + 2 * w]
-            pixels = out[c, i]
+            pixels = planes[c]
             for j in range(2 * w):
                 value = half + fine[j] + step * (np.float32(base[j]) + np.float32(grain[j]))
                 pixels[j] = np.uint8(min(max(value, zero), full))
+        row = out[i]
+        for j in range(2 * w):
+            row[3 * j], row[3 * j + 1], row[3 * j + 2] = red[j], green[j], blue[j]
+
+
+def _frame(
+    change: Float32[np.ndarray, "3 h w"], instance: SensorInstance, rng: np.random.Generator
+) -> UInt8[np.ndarray, "h2 w2 3"]:
+    oy, ox = rng.integers(0, NOISE_MARGIN, 2)
+    _, h, w = instance.background.shape
+    image = np.empty((h, 3 * w), np.uint8)
+    _blend(change, instance.background, instance.noise, oy, ox, image)
+    return image.reshape(h, w, 3)
 
 
 def render(
     surface: HeightField, instance: SensorInstance, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Render the RGB frame of a surface of half its resolution; `rng` shifts the noise."""
-    change = colour_change(surface, instance)
-    oy, ox = rng.integers(0, NOISE_MARGIN, 2)
-    planes = np.empty(instance.background.shape, np.uint8)
-    _blend(change, instance.background, instance.noise, oy, ox, planes)
-    return cv2.merge([planes[0], planes[1], planes[2]])
+    return _frame(colour_change(surface, instance), instance, rng)
 
 
 def render_untouched(
     instance: SensorInstance, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Render the RGB frame of an untouched gel: background and noise."""
-    oy, ox = rng.integers(0, NOISE_MARGIN, 2)
-    _, h, w = instance.background.shape
-    frame = instance.background + instance.noise[:, oy : oy + h, ox : ox + w]  # COUNT_STEP
-    planes = np.clip(np.float32(COUNT_STEP) * frame + np.float32(0.5), 0, 255).astype(np.uint8)
-    return cv2.merge([planes[0], planes[1], planes[2]])
+    return _frame(np.zeros_like(instance.illumination), instance, rng)
