@@ -14,6 +14,7 @@ import jaxtyping  # noqa: E402
 import pytest  # noqa: E402
 import torch  # noqa: E402
 from checked_types import jaxtyped  # noqa: E402
+from hypothesis import settings  # noqa: E402
 
 jaxtyping.jaxtyped = jaxtyped  # what --jaxtyping-packages decorates with
 from in_process import in_process_workers  # noqa: E402
@@ -21,6 +22,9 @@ from running_twin import RunningTwin  # noqa: E402
 from toy_episodes import record  # noqa: E402
 
 torch.set_num_threads(1)
+# The same examples in every run; --hypothesis-profile default searches for others.
+settings.register_profile("repeatable", derandomize=True)
+settings.load_profile("repeatable")
 # A shell that starts the tests in the background ignores Ctrl-C, for them and all their children.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
