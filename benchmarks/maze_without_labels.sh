@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # The policies that the records bead-maze-encoders and bead-maze-seeds judge: the maze by each encoder's
 # frozen embedding (Sparsh's task T5), by the wrench read out of it, and by touch that is learned with the policy;
-# of half of 130 demonstrations, and three of them of all, with three seeds. Some three hours of one core, estimated. Stopped, the same line goes on.
+# of half of 130 demonstrations, and three of them of all, with three seeds; then the table by data, touch and head.
+# Some six hours of one core, estimated. Stopped, the same line goes on.
 set -eu
 
 demos() { # name, options
@@ -58,4 +59,21 @@ for seed in 0 1 2; do
     policy "maze-all-shipped-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae --touch-input embedding
     policy "maze-all-wrench-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae
     policy "maze-all-end-to-end-$seed" --seed "$seed" --end-to-end
+done
+
+# The table by data, touch and head, one seed: a tenth, half and all of the demonstrations.
+sampled=(--head mlp --sampler.loss absolute --action-share 0.98)
+declare -A touches=(
+    [embedding]="--encoder gelsight_mini_markers_mae --touch-input embedding"
+    [wrench]="--encoder gelsight_mini_markers_mae"
+    [end-to-end]="--end-to-end"
+)
+for share in 0.1 0.5 1; do
+    for touch in embedding wrench end-to-end; do
+        # shellcheck disable=SC2206 # several words
+        inputs=(${touches[$touch]} --share "$share")
+        policy "maze-$share-$touch-regression" "${inputs[@]}"
+        policy "maze-$share-$touch-diffusion" "${inputs[@]}" "${sampled[@]}"
+        policy "maze-$share-$touch-flow" "${inputs[@]}" "${sampled[@]}" --sampler.kind flow --sampler.num-inference-steps 4
+    done
 done
