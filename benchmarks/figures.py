@@ -157,6 +157,12 @@ def named_by_sentences(metrics: Metrics) -> str:
     )
 
 
+def materials(metrics: Metrics) -> str:
+    """Share of real objects whose material is found by its sentences, first encoder."""
+    row = metrics["rows"][0]
+    return "{:.0%} [{:.0%}, {:.0%}]".format(row["accuracy"], *row["interval"])
+
+
 def faults(metrics: Metrics) -> str:
     """Faults that lose no episode, and the longest time to rest."""
     rows = metrics["rows"]
