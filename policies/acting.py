@@ -1,6 +1,5 @@
 """Learned policy: `reset()` begins an episode, `act(observation)` returns a tick's action."""
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -52,8 +51,8 @@ class LearnedPolicy:
         directory: where it was read from; None if it never was on disk.
         plan_ticks: control ticks from an observation to its plan. The next plan is requested that
             much earlier, and its actions for the ticks gone by are dropped.
-        refuses_novelty: whether `plan` raises RefusedError once touch or camera images have been unlike
-            the training for a second; set False to correct it there.
+        refuses_novelty: whether `plan` raises RefusedError once touch has been unlike the training
+            for a second; set False to correct it there.
         history_ticks: number of observations that `plan` takes: the network's own, and those before
             them that the touch encoder looks back to.
     """
@@ -102,7 +101,7 @@ class LearnedPolicy:
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
         self._maps: tuple[Observation, Tensor] | None = None  # the latest embedded camera images
         self._recent: list[Observation] = []
-        self._novel_plans: Counter[str] = Counter()  # in a row, by what was novel
+        self._novel_plans = 0  # in a row
         self._todo: list[np.ndarray] = []  # actions of the present plan
         self._next: list[np.ndarray] = []  # actions of the plan that comes next
 
@@ -140,17 +139,17 @@ class LearnedPolicy:
             return self._network.plan(batch, self._generator)[0].numpy()
 
     def _refuse_novel(self, batch: ObservationBatch) -> None:
-        """Raise RefusedError once something has been unlike the training for a second of plans."""
+        """Raise RefusedError once touch has been unlike the training for a second of plans."""
         if not self.refuses_novelty:
             return
-        for what, novelty in self._network.novelties(batch).items():
-            self._novel_plans[what] = self._novel_plans[what] + 1 if novelty > 1 else 0
-            ticks = self._novel_plans[what] * self.config.execution_horizon
-            if ticks >= NOVEL_SECONDS * self.config.control_hz:
-                raise RefusedError(
-                    f"for a second {what} has been unlike all of the training ({novelty:.1f} times "
-                    "as far from it as accepted): look for what has changed since the recordings"
-                )
+        novelty = self._network.novelty_of(batch)
+        self._novel_plans = self._novel_plans + 1 if novelty > 1 else 0
+        ticks = self._novel_plans * self.config.execution_horizon
+        if ticks >= NOVEL_SECONDS * self.config.control_hz:
+            raise RefusedError(
+                f"for a second touch has been unlike all of the training ({novelty:.1f} times "
+                "as far from it as accepted): look for what has changed since the recordings"
+            )
 
     def embed(self, history: Sequence[Observation]) -> None:
         """Embed observations before `plan` needs them: most of the work."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -28,7 +27,6 @@ from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
 from touchgoal.policies.perception.frozen_images import (
-    MAP_CHANNELS,
     ImageInputConfig,
     ImageReadout,
 )
@@ -39,7 +37,6 @@ from touchgoal.runtime.errors import UserError
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
 NOVEL_SECONDS = 1.0  # s for which novelty must last to count
 _CLIP = 5.0  # standard deviations
-_TOUCH, _SIGHT = "touch", "sight"  # what can be novel
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,7 @@ class PolicyConfig:
     # projection that is trained on the actions alone, for episodes without that truth
     touch_input: TouchInput = "wrench"
     touch_projection_dim: int = 64  # width of the projection, with "embedding"
-    watches_novelty: bool = False  # whether it has detectors of novelty, see `novelties`
+    watches_novelty: bool = False  # whether it tells touch that is unlike the training's
     # standard deviation of noise on normalised embeddings in training. Without it the network
     # recognises each recorded episode by its sensors
     touch_noise: float = 0.1
@@ -167,13 +164,8 @@ class PolicyNetwork(nn.Module):
             self.end_to_end_encoder = EndToEndEncoder(config.end_to_end)
             condition_dim += len(ft.TACTILE) * config.end_to_end.width
         self.image_readout = ImageReadout(config.images) if config.images else None
-        self._novelty = nn.ModuleDict(
-            {
-                what: NoveltyDetector(dim)
-                for what, dim in self._embedding_dims().items()
-                if config.watches_novelty
-            }
-        )
+        watches = config.watches_novelty and config.touch_dim > 0
+        self.novelty = NoveltyDetector(config.touch_dim) if watches else None
         if self.image_readout:
             condition_dim += self.image_readout.width
         self.condition_dim = condition_dim
@@ -210,35 +202,15 @@ class PolicyNetwork(nn.Module):
         chunks = to_representation(actions, joints, kind)
         self.action_normalizer.fit_range(chunks, valid, self.config.action_share)
 
-    @property
-    def detectors(self) -> dict[str, NoveltyDetector]:
-        """Detectors of novelty, by what they watch."""
-        return cast(dict[str, NoveltyDetector], dict(self._novelty))
-
-    def _embedding_dims(self) -> dict[str, int]:
-        cameras = self.config.images.cameras if self.config.images else ()
-        dims = {_TOUCH: self.config.touch_dim, _SIGHT: len(cameras) * MAP_CHANNELS}
-        return {what: dim for what, dim in dims.items() if dim}
-
-    def fit_novelty(
-        self,
-        touch: Float[Tensor, "n e"],
-        maps: Float16[Tensor, "n k c y x"] | None,
-        lengths: Sequence[int],
-    ) -> None:
-        """Fit the detectors of novelty to the ticks of episodes of these lengths."""
-        ticks = round(NOVEL_SECONDS * self.config.control_hz)
-        for what, detector in self.detectors.items():
-            detector.fit(_embedding(what, touch, maps), lengths, ticks)
+    def fit_novelty(self, touch: Float[Tensor, "n e"], lengths: Sequence[int]) -> None:
+        """Fit the detector of novelty, where there is one, to the ticks of episodes of these lengths."""
+        if self.novelty:
+            self.novelty.fit(touch, lengths, round(NOVEL_SECONDS * self.config.control_hz))
 
     @torch.inference_mode()
-    def novelties(self, batch: ObservationBatch) -> dict[str, float]:
-        """Return the novelty of the first observation's latest tick; what exceeds 1 is unknown."""
-        latest = batch.touch[:1, -1]
-        return {
-            what: detector(_embedding(what, latest, batch.maps)).item()
-            for what, detector in self.detectors.items()
-        }
+    def novelty_of(self, batch: ObservationBatch) -> float:
+        """Return the novelty of the first observation's latest touch; above 1 it is unknown."""
+        return self.novelty(batch.touch[:1, -1]).item() if self.novelty else 0.0
 
     def loss(
         self,
@@ -311,13 +283,3 @@ class PolicyNetwork(nn.Module):
             assert batch.maps is not None, "needs the cameras' feature maps"
             parts.append(self.image_readout(batch.maps.float()))
         return torch.cat(parts, 1)
-
-
-def _embedding(
-    what: str, touch: Float[Tensor, "n e"], maps: Float16[Tensor, "n k c y x"] | None
-) -> Float[Tensor, "n d"]:
-    """Return touch, or the mean of each channel of the cameras' maps."""
-    if what == _TOUCH:
-        return touch
-    assert maps is not None, "needs the cameras' feature maps"
-    return maps.mean((-2, -1), dtype=torch.float32).flatten(1)

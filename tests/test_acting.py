@@ -70,11 +70,12 @@ def test_a_second_of_touch_unlike_the_training_is_refused() -> None:
     config = replace(TOY, touch_dim=touch.dim, watches_novelty=True, execution_horizon=2)
     windows = toy_dataset(config)
     policy, recorded = toy_policy(config, windows).eval(), windows.recorded
-    policy.fit_novelty(recorded.touch.float(), None, recorded.lengths)
+    policy.fit_novelty(recorded.touch.float(), recorded.lengths)
     actor, ticks = LearnedPolicy(policy, touch), toy_observations(20)
     for tick in ticks:  # without a limit every touch is accepted
         actor.act(tick)
-    policy.detectors["touch"].limit.fill_(1e-3)
+    assert policy.novelty
+    policy.novelty.limit.fill_(1e-3)
     actor.reset()
     for tick in ticks[:18]:
         actor.act(tick)

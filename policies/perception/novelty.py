@@ -1,4 +1,4 @@
-"""Novelty of what a policy feels and sees: how little of it the training's variation explains."""
+"""Novelty of what a policy feels: how little of it the training's variation explains."""
 
 import math
 from collections.abc import Sequence

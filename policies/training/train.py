@@ -55,7 +55,7 @@ def train(
         recorded.touch.float(), recorded.state, windows.joints, windows.actions,
         recorded.wrench, windows.action_is_pad, recorded.maps,
     )  # fmt: skip
-    network.fit_novelty(recorded.touch.float(), recorded.maps, recorded.lengths)
+    network.fit_novelty(recorded.touch.float(), recorded.lengths)
     average = AveragedModel(network, multi_avg_fn=_update_average).eval().requires_grad_(False)
     averaged = cast(PolicyNetwork, average.module)
 
