@@ -26,10 +26,7 @@ from touchgoal.policies.heads.diffusion import (
 from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
-from touchgoal.policies.perception.frozen_images import (
-    ImageInputConfig,
-    ImageReadout,
-)
+from touchgoal.policies.perception.frozen_images import ImageInputConfig, ImageReadout
 from touchgoal.policies.perception.novelty import NoveltyDetector
 from touchgoal.policies.perception.proprioception import input_widths, is_position, network_input
 from touchgoal.runtime.errors import UserError

@@ -1,8 +1,6 @@
 """Novelty of embeddings: those off the training's plane."""
 
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from toy_policies import torch_rng
 
 from touchgoal.policies.perception.novelty import NoveltyDetector
@@ -28,17 +26,17 @@ def novel(detector: NoveltyDetector, embedded: torch.Tensor) -> bool:
     return bool((detector(embedded) > 1).unfold(0, TICKS, 1).all(1).any())
 
 
-@settings(max_examples=5, deadline=None)
-@given(st.integers(0, 1000))
-def test_few_episodes_like_the_training_are_novel_and_all_off_the_plane_are(seed: int) -> None:
-    training, new = episodes(200, seed), episodes(200, seed + 10_000)
-    detector = fitted(training)
-    assert sum(novel(detector, episode) for episode in training[1::2]) == 4  # (100 + 1) 5 % - 1
-    # The limit's own share varies as Beta(5, 96): above a fifth once in 10^5 trainings.
-    assert sum(novel(detector, episode) for episode in new) <= 60
-    off = torch.randn(8, generator=torch_rng(seed))
-    off -= off @ PLANE.T @ PLANE
-    assert all(novel(detector, episode + off / off.norm()) for episode in new)
+def test_one_episode_in_twenty_is_novel_and_all_off_the_plane_are() -> None:
+    alarms = 0
+    for seed in range(10):
+        training, new = episodes(200, seed), episodes(200, seed + 10_000)
+        detector = fitted(training)
+        assert sum(novel(detector, episode) for episode in training[1::2]) == 4  # (100 + 1) 5 % - 1
+        alarms += sum(novel(detector, episode) for episode in new)
+        off = torch.randn(8, generator=torch_rng(seed))
+        off -= off @ PLANE.T @ PLANE
+        assert all(novel(detector, episode + off / off.norm()) for episode in new)
+    assert alarms <= 168  # 5 % of 2,000, and four deviations: limits vary, too, as Beta(5, 96)
 
 
 def test_few_episodes_set_no_limit() -> None:

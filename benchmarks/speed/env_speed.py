@@ -63,7 +63,11 @@ def _env(config: Config) -> list[Row]:
         ("physics alone", PickPlaceConfig(cameras=(), tactile=False), ["soda_can"]),
         ("two tactile images", PickPlaceConfig(cameras=()), both),
         ("two tactile + one 128x128 camera", PickPlaceConfig(cameras=("front",)), both),
-        ("the same with full meshes", PickPlaceConfig(cameras=("front",), meshes="full"), both[:1]),
+        (
+            "two tactile + camera, full meshes",
+            PickPlaceConfig(cameras=("front",), meshes="full"),
+            both,
+        ),
     ):
         env = PickPlace(replace(task, max_seconds=1e6))
         for name in objects:

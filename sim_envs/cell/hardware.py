@@ -99,8 +99,7 @@ class SimulatedHardware(ABC):
     def contact_force(self) -> Float[np.ndarray, "3"]:
         """Return the robot's contact force (N) in the last step, base frame; 0 if small.
 
-        Reading contacts takes as long as a physics step, so they are read only if the torque on some
-        joint exceeds `_LEAST_TORQUE`.
+        To save time, contacts are read only if the torque on some joint exceeds `_LEAST_TORQUE`.
         """
         if max(map(abs, self._constraint_torque.tolist())) < _LEAST_TORQUE:
             return _NO_FORCE

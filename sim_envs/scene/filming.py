@@ -22,7 +22,7 @@ class SceneRecorder:
     """
 
     def __init__(self, env: FrankaTactileEnv, meshes: Literal["fast", "full"] = "full") -> None:
-        """Film with full meshes and shadows, or 40 times faster (see `SceneConfig.meshes`)."""
+        """Film with full meshes and shadows, or much faster without (see `SceneConfig.meshes`)."""
         self._env = env
         spec = env.scene(replace(env.config, meshes=meshes))
         self._model = spec.compile()

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-_FEWEST = 100  # triangles; smaller meshes stay as they are
+_FEWEST = 100  # triangles; a mesh that would have fewer stays as it is
 
 
 def merge_corners(spec: mujoco.MjSpec, names: set[str], size: float) -> None:

@@ -141,9 +141,8 @@ class TactilePad:
         grid, material = self._image_grid, self._materials[body]
         height = _height(geoms, grid)
         press.push_in(height, grid.pitch)
-        if material.texture:
-            position, rotation = self._pose(data, data.xpos[body], data.xmat[body])
-            add_texture(height, grid.pitch, material, position - [0, 0, press.shift], rotation)
+        position, rotation = self._pose(data, data.xpos[body], data.xmat[body])
+        add_texture(height, grid.pitch, material, position - [0, 0, press.shift], rotation)
         cv2.threshold(height, 0, 0, cv2.THRESH_TOZERO, dst=height)
         height *= np.float32(self._modulus(material) / self._sensor.foundation_modulus)
         return height
@@ -155,12 +154,12 @@ class TactilePad:
             position, rotation = self._pose(data, data.geom_xpos[geom], data.geom_xmat[geom])
             if geom in self._meshes:
                 vertices, faces = self._meshes[geom]
-                add = partial(add_mesh, vertices=vertices, faces=faces)
+                shape = partial(add_mesh, vertices=vertices, faces=faces)
             else:
                 kind, size = int(self._model.geom_type[geom]), self._model.geom_size[geom]
-                add = partial(add_primitive, kind=kind, size=size)
-            pose = position.astype(np.float32), rotation.astype(np.float32)
-            placed.append(partial(add, position=pose[0], rotation=pose[1]))
+                shape = partial(add_primitive, kind=kind, size=size)
+            position, rotation = position.astype(np.float32), rotation.astype(np.float32)
+            placed.append(partial(shape, position=position, rotation=rotation))
         return placed
 
     def _pose(

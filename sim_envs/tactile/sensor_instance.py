@@ -8,7 +8,7 @@ from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int8, Int16, Shaped, UInt8
+from jaxtyping import Float, Float32, Int8, Int16, UInt8
 from numba import njit
 
 from touchgoal.control.tactile.sensor_calibration import (
@@ -130,12 +130,8 @@ def _read(
 ) -> tuple[SensorCalibration, Float32[np.ndarray, "3 h3 w3"]]:
     typical, half = load(folder), (shape[1] // 2, shape[0] // 2)
     light = illumination(typical.background, typical.illumination_exponent)
-    light = _planar(cv2.resize(light, half, interpolation=cv2.INTER_AREA), np.float32)
-    return typical, light
-
-
-def _planar(image: Shaped[np.ndarray, "h w 3"], kind: type) -> Shaped[np.ndarray, "3 h w"]:
-    return np.ascontiguousarray(np.moveaxis(image, -1, 0), kind)
+    light = cv2.resize(light, half, interpolation=cv2.INTER_AREA)
+    return typical, np.ascontiguousarray(np.moveaxis(light, -1, 0), np.float32)
 
 
 def _turned(
