@@ -30,6 +30,7 @@ from touchgoal.policies.evaluation import open_loop
 from touchgoal.policies.evaluation.evaluate import Trial, run_trials
 from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.frozen_touch import shipped_touch
@@ -137,8 +138,8 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
         name = f"{' and '.join(inputs) or 'state only'}, {episodes} demos"
         if config.touch_dim and config.touch_input == "embedding":
             name += ", not taught by wrenches"
-        if isinstance(config.head, MLPConfig):
-            name += ", regression"
+        flow = isinstance(config.head, DiffusionConfig) and config.head.sampler.kind == "flow"
+        name += ", regression" * isinstance(config.head, MLPConfig) + ", flow" * flow
         arms.setdefault(name, []).append(directory)
     return arms
 
