@@ -157,6 +157,15 @@ def named_by_sentences(metrics: Metrics) -> str:
     )
 
 
+def captioned(metrics: Metrics, row: str) -> str:
+    """Share of touches whose own sentence comes first, on seen and on unseen objects."""
+    found = next(r for r in metrics["rows"] if r["row"] == row)
+    return "; ".join(
+        "{} {:.0f} % [{:.0f}, {:.0f}]".format(kind, *found[f"{kind} top-1"])
+        for kind in ("seen", "unseen")
+    )
+
+
 def materials(metrics: Metrics) -> str:
     """Share of real objects whose material is found by its sentences, first encoder."""
     row = metrics["rows"][0]
