@@ -81,8 +81,9 @@ class Config(TrainingOptions):
     end_to_end: bool = False
     """Train a touch ViT jointly with the policy, instead of a frozen encoder."""
     cameras: tuple[str, ...] = ()
-    """Cameras that the policy reads, such as front wrist: keypoints of a frozen image encoder's
-    feature maps, read at every plan; default: none."""
+    """Cameras that the policy reads at every plan, such as front wrist; default: none. A frozen image
+    encoder's feature maps tell it the next key pose: where the hand will be when the gripper next
+    opens or closes. A camera with wrist or hand in its name moves with the hand."""
     hand_force: bool = False
     """The policy also reads the force and torque on the hand; not with body_twist."""
     estimator: Path | None = None

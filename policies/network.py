@@ -26,7 +26,8 @@ from touchgoal.policies.heads.diffusion import (
 from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
-from touchgoal.policies.perception.frozen_images import ImageInputConfig, ImageReadout
+from touchgoal.policies.perception.frozen_images import ImageInputConfig
+from touchgoal.policies.perception.key_pose import KEY_POSE_DIM, KeyPoseReadout
 from touchgoal.policies.perception.novelty import NoveltyDetector
 from touchgoal.policies.perception.proprioception import input_widths, is_position, network_input
 from touchgoal.runtime.errors import UserError
@@ -160,11 +161,10 @@ class PolicyNetwork(nn.Module):
         if config.end_to_end:
             self.end_to_end_encoder = EndToEndEncoder(config.end_to_end)
             condition_dim += len(ft.TACTILE) * config.end_to_end.width
-        self.image_readout = ImageReadout(config.images) if config.images else None
+        self.key_pose = KeyPoseReadout(config.images) if config.images else None
         watches = config.watches_novelty and config.touch_dim > 0
         self.novelty = NoveltyDetector(config.touch_dim) if watches else None
-        if self.image_readout:
-            condition_dim += self.image_readout.width
+        condition_dim += KEY_POSE_DIM if self.key_pose else 0
         self.condition_dim = condition_dim
         if isinstance(config.head, DiffusionConfig):
             self.head = Diffusion(config.head, ticks, ACTION_DIM, condition_dim)
@@ -180,6 +180,7 @@ class PolicyNetwork(nn.Module):
         wrench: Float[Tensor, "n 12"] | None = None,
         action_is_pad: Bool[Tensor, "m h"] | None = None,
         maps: Float16[Tensor, "n k c y x"] | None = None,
+        key_pose: Float[Tensor, "n 7"] | None = None,
     ) -> None:
         """Fit the normalizers to training data: n ticks, and the chunks of m windows.
 
@@ -190,9 +191,9 @@ class PolicyNetwork(nn.Module):
             self.touch_normalizer.fit_mean_std(touch)
         if wrench is not None:
             self.wrench_normalizer.fit_mean_std(wrench)
-        if self.image_readout:
-            assert maps is not None, "needs the cameras' feature maps"
-            self.image_readout.fit(maps)
+        if self.key_pose:
+            assert maps is not None and key_pose is not None, "needs maps and key poses"
+            self.key_pose.fit(maps, *self._hand(state), key_pose)
         columns, kind = self.config.proprioception, self.config.representation
         self.state_normalizer.fit_mean_std(network_input(state, columns, kind))
         valid = None if action_is_pad is None else ~action_is_pad[..., None]
@@ -216,10 +217,11 @@ class PolicyNetwork(nn.Module):
         noise: BatchNoise,
         wrench: Float[Tensor, "b o 12"] | None = None,
         action_is_pad: Bool[Tensor, "b h"] | None = None,
+        key_pose: Float[Tensor, "b 7"] | None = None,
     ) -> Float[Tensor, ""]:
         """Return the training loss on windows, without ticks after the episode's end.
 
-        With `reads_wrench` it needs the wrenches on both pads.
+        With `reads_wrench` it needs the wrenches on both pads, with cameras the next key poses.
         """
         chunk = to_representation(actions, batch.joints, self.config.representation)
         touch = self._encode_touch(batch, noise)
@@ -230,7 +232,28 @@ class PolicyNetwork(nn.Module):
             touch = touch.detach()
         encoded = self._encode(batch, touch, noise)
         loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
+        if self.key_pose:
+            assert batch.maps is not None and key_pose is not None, "needs maps and key poses"
+            loss = loss + self.key_pose.loss(
+                batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose
+            )
         return loss + wrench_loss
+
+    @torch.no_grad()
+    def key_pose_error(
+        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 7"]
+    ) -> Float[Tensor, " b"]:
+        """Return how far off sight sees the next key pose, m."""
+        assert self.key_pose and batch.maps is not None, "needs cameras"
+        return self.key_pose.error(batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose)
+
+    def _hand(
+        self, state: Float[Tensor, "b s"]
+    ) -> tuple[Float[Tensor, "b 7"], Float[Tensor, "b 1"]]:
+        """Return the TCP's pose and the gripper's width."""
+        widths = [ft.FEATURES[key].shape[0] for key in self.config.proprioception]
+        columns = dict(zip(self.config.proprioception, state.split(widths, 1), strict=True))
+        return columns[ft.TCP_POSE], columns[ft.STATE][:, -1:]
 
     @torch.inference_mode()
     def plan(self, batch: ObservationBatch, generator: torch.Generator) -> Float[Tensor, "b h 8"]:
@@ -276,7 +299,7 @@ class PolicyNetwork(nn.Module):
         if self.end_to_end_encoder:
             assert batch.pictures is not None, "needs tactile images"
             parts.append(self.end_to_end_encoder(batch.pictures))
-        if self.image_readout:
+        if self.key_pose:
             assert batch.maps is not None, "needs the cameras' feature maps"
-            parts.append(self.image_readout(batch.maps.float()))
+            parts.append(self.key_pose(batch.maps.float(), *self._hand(batch.state[:, -1]), noise))
         return torch.cat(parts, 1)

@@ -262,7 +262,7 @@ def test_a_tick_embeds_like_its_episode_and_another_size_is_refused() -> None:
     embedder = ImageEmbedder(ImageInputConfig((ft.FRONT, ft.WRIST), (64, 96)))
     together = embedder._maps(images)
     alone = embedder.embed_tick({ft.FRONT: images[4], ft.WRIST: images[0]})
-    assert alone.shape == embedder.shape == (2, 112, 14, 21)
+    assert alone.shape == embedder.shape == (2, 40, 28, 42)
     np.testing.assert_allclose(alone, together[[4, 0]], atol=2e-2)
     with pytest.raises(UserError, match="camera images are 64 x 64, the policy reads 64 x 96"):
         embedder.embed_tick({ft.FRONT: images[0, :, :64], ft.WRIST: images[0]})

@@ -27,6 +27,7 @@ STAGES = (  # kernel, stride of the first block, expansion, output channels, rep
     (3, 1, 6, 320, 1),
 )
 MAP_BLOCK = 10  # last block at stride 16, whose features still say where in the image something is
+FINE_BLOCK = 4  # last block at stride 8
 _BATCH_NORM_EPS = 1e-3  # TensorFlow's default, under which the weights were trained
 
 
@@ -101,6 +102,10 @@ class EfficientNetLite0(nn.Module):
     def map(self, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 112 y x"]:
         """Return the feature map at stride 16; `finish` makes the pooled features of it."""
         return self.blocks[: MAP_BLOCK + 1](self.stem(x))
+
+    def fine_map(self, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 40 y x"]:
+        """Return the feature map at stride 8."""
+        return self.blocks[: FINE_BLOCK + 1](self.stem(x))
 
     def finish(self, features: Float[Tensor, "n 112 y x"]) -> Float[Tensor, "n 1280"]:
         """Return the pooled features of a map at stride 16."""

@@ -73,7 +73,7 @@ def network_input(
             parts[ft.TCP_POSE] = _vertical_in_body_frame(parts[ft.TCP_POSE][..., 3:])
     elif ft.TCP_POSE in parts:
         pose = parts[ft.TCP_POSE]
-        turned = _rotation_6d(pose[..., 3:])
+        turned = rotation_6d(pose[..., 3:])
         if ft.TRUTH_START in parts:
             held = parts[ft.TRUTH_CONTACT].amin(-1, keepdim=True)
             parts[ft.TRUTH_START] = _start_from_hand(
@@ -120,7 +120,8 @@ def _start_from_hand(
     return torch.cat([way, yaw, way / (way.abs() + _LENGTH_SCALE)], -1)
 
 
-def _rotation_6d(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 6"]:
+def rotation_6d(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 6"]:
+    """Return the first two columns of the rotation matrix of a quaternion (w, x, y, z)."""
     w, x, y, z = quaternion.unbind(-1)
     columns = [
         1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),

@@ -16,6 +16,7 @@ from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
 from touchgoal.policies.perception.frozen_images import ImageEmbedder
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+from touchgoal.policies.perception.key_pose import next_key_poses
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.runtime.errors import UserError
@@ -34,6 +35,7 @@ class Recordings:
     pictures: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
     wrench: Float32[Tensor, "n 12"] | None = None  # on both pads (N, Nm, pad frames), if trained on
     maps: Float16[Tensor, "n k c y x"] | None = None  # of the cameras, see `ImageEmbedder`
+    key_pose: Float32[Tensor, "n 7"] | None = None  # the next one, beside `maps`
 
 
 def load_recordings(
@@ -55,7 +57,7 @@ def load_recordings(
     images = ImageEmbedder(config.images) if config.images else None
     maps = embed_episodes(episodes, chosen, images, workers) if images else []
     keys = [*config.proprioception, ft.ACTION, *[ft.TRUTH_PAD_WRENCH] * config.reads_wrench]
-    touch, state, actions, pictures, wrench = [], [], [], [], []
+    touch, state, actions, pictures, wrench, tcp = [], [], [], [], [], []
     for n, i in enumerate(track(chosen, "reading", "episode")):
         frames = episodes.read(i, keys).frames
         if ft.WRENCH in frames:
@@ -63,19 +65,26 @@ def load_recordings(
         start = skip[n] if skip else 0
         state.append(np.concatenate([frames[key][start:] for key in config.proprioception], 1))
         actions.append(frames[ft.ACTION][start:])
+        if images:
+            tcp.append(frames[ft.TCP_POSE][start:])
         if config.reads_wrench:
             wrench.append(frames[ft.TRUTH_PAD_WRENCH][start:])
         no_touch = np.empty((len(actions[-1]), 0), np.float16)
         touch.append(embedded[n][start:] if embedded else no_touch)
         if config.end_to_end:
             pictures.append(_difference_images(episodes, i, config.end_to_end)[start:])
-    parts = (torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions))
+    parts = [torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions)]
+    lengths = tuple(len(rows) for rows in actions)
+    key_pose = (
+        next_key_poses(np.concatenate(tcp), parts[2][:, -1].numpy(), lengths) if images else None
+    )
     return Recordings(
         *parts,
-        lengths=tuple(len(rows) for rows in actions),
+        lengths=lengths,
         pictures=torch.from_numpy(np.concatenate(pictures)) if config.end_to_end else None,
         wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
         maps=_joined(maps, skip) if images else None,
+        key_pose=None if key_pose is None else torch.from_numpy(key_pose),
     )
 
 
@@ -194,3 +203,7 @@ class SequenceDataset:
         """Return the wrenches on both pads in some windows, if they were read."""
         wrench = self.recorded.wrench
         return None if wrench is None else wrench[self._observed[rows]]
+
+    def key_pose(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b 7"] | None:
+        """Return the next key pose at the latest tick of some windows, with cameras."""
+        return None if self.recorded.key_pose is None else self.recorded.key_pose[rows]

@@ -53,7 +53,7 @@ def train(
         network = PolicyNetwork(policy)
     network.fit_normalizers(
         recorded.touch.float(), recorded.state, windows.joints, windows.actions,
-        recorded.wrench, windows.action_is_pad, recorded.maps,
+        recorded.wrench, windows.action_is_pad, recorded.maps, recorded.key_pose,
     )  # fmt: skip
     network.fit_novelty(recorded.touch.float(), recorded.lengths)
     average = AveragedModel(network, multi_avg_fn=_update_average).eval().requires_grad_(False)
@@ -124,10 +124,11 @@ class _PolicyLoss(nn.Module):
         wrench: Float[Tensor, "b o 12"] | None,
         actions: Float[Tensor, "b h 8"],
         action_is_pad: Bool[Tensor, "b h"],
+        key_pose: Float[Tensor, "b 7"] | None,
         noise: BatchNoise,
     ) -> dict[str, Tensor]:
         batch = ObservationBatch(touch, state, pictures, maps)
-        return {"loss": self.policy.loss(batch, actions, noise, wrench, action_is_pad)}
+        return {"loss": self.policy.loss(batch, actions, noise, wrench, action_is_pad, key_pose)}
 
 
 def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, Any]:
@@ -140,6 +141,7 @@ def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, 
         "wrench": windows.wrench(rows),
         "actions": actions,
         "action_is_pad": windows.action_is_pad[rows],
+        "key_pose": windows.key_pose(rows),
     }
 
 
@@ -147,7 +149,7 @@ def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, 
 def _validate(
     policy: PolicyNetwork, windows: SequenceDataset, config: TrainConfig, seed: int
 ) -> dict[str, float]:
-    """Return the loss, and the error of the joint change (rad) planned over the chunk."""
+    """Return the loss, the error of the joint change (rad) planned over the chunk, and of sight (m)."""
     n = min(config.validation_windows, len(windows))
     rows = torch.linspace(0, len(windows) - 1, n).long()
     device = policy.action_normalizer.scale.device
@@ -158,20 +160,34 @@ def _validate(
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
     error = off.sum(1).norm(dim=1).mean()
-    loss = policy.loss(observed, batch["actions"], BatchNoise(generator), batch["wrench"], is_pad)
-    return {"validation_loss": loss.item(), "validation_error": error.item()}
+    loss = policy.loss(
+        observed,
+        batch["actions"],
+        BatchNoise(generator),
+        batch["wrench"],
+        is_pad,
+        batch["key_pose"],
+    )
+    metrics = {"validation_loss": loss.item(), "validation_error": error.item()}
+    if batch["key_pose"] is not None:
+        off = policy.key_pose_error(observed, batch["key_pose"])
+        metrics["validation_key_pose_error"] = off.median().item()
+    return metrics
 
 
 def _checksum(windows: SequenceDataset) -> str:
     recorded = windows.recorded
     return checksum(
         recorded.touch, recorded.state, recorded.actions, recorded.pictures, recorded.wrench,
-        recorded.maps, map(str, recorded.lengths), windows.weights,
+        recorded.maps, recorded.key_pose, map(str, recorded.lengths), windows.weights,
     )  # fmt: skip
 
 
 def _progress(metrics: dict[str, float]) -> str:
-    return (
+    text = (
         f"loss {metrics['loss']:.4f} in training, {metrics['validation_loss']:.4f} in validation; "
         f"planned joint change off by {1000 * metrics['validation_error']:.2f} mrad"
     )
+    if "validation_key_pose_error" in metrics:
+        text += f", next key pose by {1000 * metrics['validation_key_pose_error']:.0f} mm"
+    return text

@@ -1,0 +1,158 @@
+"""The next key pose: where the hand will be when the gripper next opens or closes, or the task ends.
+
+The recordings hold it (keyframes: James and Davison 2022), and camera images show it. A policy that is
+taught it finds things by sight from fifty demonstrations; one that has only the actions to learn
+from recognises the recordings instead.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16, Float32
+from torch import Tensor, nn
+
+from touchgoal.encoders.training.batch_noise import BatchNoise
+from touchgoal.policies.actions import Normalizer
+from touchgoal.policies.perception.frozen_images import ImageInputConfig, ImageReadout
+from touchgoal.policies.perception.proprioception import rotation_6d
+
+KEY_POSE_DIM = 12  # of `KeyPoseReadout.forward`
+_POSE = 9  # position, and two columns of the rotation matrix
+_LEVELS = 1e-3  # m between the least and the greatest commanded width: less is one width
+_POSITION, _ROTATION = 0.05, 0.3  # m and rad that weigh alike
+_SMALL = 0.1  # of these, below which an error counts squared
+_NEAR = 0.02  # m, displacements of this size are told apart best
+_NOISE = 0.005  # m and, of the rotation's columns, 1; on what the policy reads in training
+_LEAST, _MOST = -5.0, 3.0  # logarithm of a camera's expected error
+
+
+def next_key_poses(
+    tcp: Float32[np.ndarray, "n 7"], widths: Float32[np.ndarray, " n"], lengths: Sequence[int]
+) -> Float32[np.ndarray, "n 7"]:
+    """Return for every tick the TCP pose at the next change of the commanded width, or at the end.
+
+    `lengths` are the ticks of each episode, one after the other.
+    """
+    closed = widths < (widths.min() + widths.max()) / 2
+    changes = np.flatnonzero(np.diff(closed)) if np.ptp(widths) > _LEVELS else []
+    ends = np.cumsum(lengths) - 1
+    keys = np.union1d(changes, ends).astype(np.int64)
+    return tcp[keys[np.searchsorted(keys, np.arange(len(tcp)))]]
+
+
+class KeyPoseReadout(nn.Module):
+    """Network from the cameras' feature maps to the next key pose relative to the hand.
+
+    Each camera gives an estimate and the error that it expects: one on the hand in the hand's frame,
+    another in the base's. The estimates are averaged, the surer ones with more weight.
+    """
+
+    def __init__(self, config: ImageInputConfig) -> None:
+        super().__init__()
+        self.on_hand = config.on_hand
+        self.readouts = nn.ModuleList(ImageReadout(config) for _ in config.cameras)
+        self.state_normalizer, self.place_normalizer = Normalizer((2,)), Normalizer((3,))
+        width, hidden = ImageReadout.width(config) + 2, 128
+        self.heads = nn.ModuleList(
+            nn.Sequential(
+                nn.Linear(width, hidden), nn.Mish(),
+                nn.Linear(hidden, hidden), nn.Mish(),
+                nn.Linear(hidden, _POSE + 2),
+            )
+            for _ in config.cameras
+        )  # fmt: skip
+
+    def fit(
+        self,
+        maps: Float16[Tensor, "n k c y x"],
+        tcp: Float[Tensor, "n 7"],
+        width: Float[Tensor, "n 1"],
+        key: Float[Tensor, "n 7"],
+    ) -> None:
+        """Fit the normalizers to training data."""
+        for camera, readout in enumerate(self.readouts):
+            readout.fit(maps[:, camera])
+        self.state_normalizer.fit_mean_std(torch.cat([tcp[:, 2:3], width], 1))
+        self.place_normalizer.fit_mean_std(key[:, :3])
+
+    def forward(
+        self,
+        maps: Float[Tensor, "b k c y x"],
+        tcp: Float[Tensor, "b 7"],
+        width: Float[Tensor, "b 1"],
+        noise: BatchNoise | None = None,
+    ) -> Float[Tensor, "b 12"]:
+        """Return the estimate for a policy, with the training's noise if given."""
+        poses, expected = self._estimates(maps, tcp, width)
+        weights = (-2 * expected).softmax(1)  # inverse squares of the expected errors
+        weights = weights.repeat_interleave(torch.tensor([3, 6]).to(tcp.device), 2)
+        pose = (weights * poses).sum(1).detach()
+        if noise is not None:
+            scale = torch.tensor([_NOISE] * 3 + [_NOISE / _POSITION * _ROTATION] * 6)
+            pose = pose + noise.randn(pose.shape).to(pose) * scale.to(pose)
+        away = pose[:, :3]
+        return torch.cat([away / _POSITION, away / (away.abs() + _NEAR), pose[:, 3:]], 1)
+
+    def loss(
+        self,
+        maps: Float[Tensor, "b k c y x"],
+        tcp: Float[Tensor, "b 7"],
+        width: Float[Tensor, "b 1"],
+        key: Float[Tensor, "b 7"],
+    ) -> Float[Tensor, ""]:
+        """Return the loss of the estimates and of the errors that the cameras expect of them.
+
+        The latter does not weigh the former (Seitzer et al. 2022): hard images are learned, too.
+        """
+        poses, expected = self._estimates(maps, tcp, width)
+        off = poses - _in_hand_frame(tcp, _columns(key))[:, None]
+        off = off[..., :3].norm(dim=-1) / _POSITION, off[..., 3:].norm(dim=-1) / _ROTATION
+        errors = torch.stack(off, -1)
+        errors = torch.where(errors < _SMALL, errors.square() / 2 / _SMALL, errors - _SMALL / 2)
+        sureness = errors.detach() * (-expected).exp() + expected
+        return errors.mean() + 0.1 * sureness.mean()
+
+    def error(
+        self,
+        maps: Float[Tensor, "b k c y x"],
+        tcp: Float[Tensor, "b 7"],
+        width: Float[Tensor, "b 1"],
+        key: Float[Tensor, "b 7"],
+    ) -> Float[Tensor, " b"]:
+        """Return how far the estimates are off, m."""
+        away = self(maps, tcp, width)[:, :3] * _POSITION
+        return (away - _in_hand_frame(tcp, _columns(key))[:, :3]).norm(dim=1)
+
+    def _estimates(
+        self,
+        maps: Float[Tensor, "b k c y x"],
+        tcp: Float[Tensor, "b 7"],
+        width: Float[Tensor, "b 1"],
+    ) -> tuple[Float[Tensor, "b k 9"], Float[Tensor, "b k 2"]]:
+        """Return each camera's pose in the hand's frame, and the logarithm of its expected errors."""
+        state = self.state_normalizer(torch.cat([tcp[:, 2:3], width], 1))
+        poses, expected = [], []
+        for camera, (readout, head) in enumerate(zip(self.readouts, self.heads, strict=True)):
+            found = head(torch.cat([readout(maps[:, camera]), state], 1))
+            pose, error = found.split([_POSE, 2], 1)
+            if self.on_hand[camera]:
+                pose = torch.cat([pose[:, :3] * _POSITION, pose[:, 3:]], 1)
+            else:
+                place = self.place_normalizer.inverse(pose[:, :3])
+                pose = _in_hand_frame(tcp, torch.cat([place, pose[:, 3:]], 1))
+            poses.append(pose)
+            expected.append(error.clamp(_LEAST, _MOST))
+        return torch.stack(poses, 1), torch.stack(expected, 1)
+
+
+def _columns(pose: Float[Tensor, "b 7"]) -> Float[Tensor, "b 9"]:
+    return torch.cat([pose[:, :3], rotation_6d(pose[:, 3:])], 1)
+
+
+def _in_hand_frame(tcp: Float[Tensor, "b 7"], pose: Float[Tensor, "b 9"]) -> Float[Tensor, "b 9"]:
+    """Return a pose of the base frame (position, two columns of the rotation) in the hand's."""
+    x, y = rotation_6d(tcp[:, 3:]).split(3, 1)
+    axes = torch.stack([x, y, torch.linalg.cross(x, y)], 1)  # the hand's, as rows
+    rows = pose - torch.cat([tcp[:, :3], torch.zeros_like(pose[:, 3:])], 1)
+    return (rows.unflatten(1, (3, 3)) @ axes.mT).flatten(1)

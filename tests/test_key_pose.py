@@ -1,0 +1,85 @@
+"""The next key pose: labels from recordings, frames, and that sight finds a thing at new places."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from touchgoal.control import features as ft
+from touchgoal.policies.perception.frozen_images import ImageInputConfig
+from touchgoal.policies.perception.key_pose import (
+    KeyPoseReadout,
+    _columns,
+    _in_hand_frame,
+    next_key_poses,
+)
+
+
+@pytest.mark.parametrize(
+    ("widths", "lengths", "keys"),
+    [
+        ([0.08, 0.08, 0.0, 0.0, 0.0, 0.08, 0.08], [7], [1, 1, 4, 4, 4, 6, 6]),
+        ([0.08, 0.0, 0.0, 0.08, 0.0, 0.0], [3, 3], [0, 2, 2, 3, 5, 5]),
+        ([0.05, 0.0501, 0.05, 0.0502], [2, 2], [1, 1, 3, 3]),  # noise on one width
+    ],
+)
+def test_a_key_pose_is_where_the_gripper_changes_or_the_episode_ends(
+    widths: list[float], lengths: Sequence[int], keys: list[int]
+) -> None:
+    tcp = np.random.default_rng(0).normal(size=(len(widths), 7)).astype(np.float32)
+    found = next_key_poses(tcp, np.array(widths, np.float32), lengths)
+    np.testing.assert_array_equal(found, tcp[keys])
+
+
+def _poses(rng: np.random.Generator, n: int) -> torch.Tensor:
+    """Random hand poses over a table, fingers down and turned by up to 0.8 rad."""
+    turn = Rotation.from_euler("z", rng.uniform(-0.8, 0.8, (n, 1)))
+    quaternion = (turn * Rotation.from_quat([1, 0, 0, 0])).as_quat(scalar_first=True)
+    place = rng.uniform([0.4, -0.2, 0.1], [0.6, 0.2, 0.3], (n, 3))
+    return torch.from_numpy(np.concatenate([place, quaternion], 1)).float()
+
+
+def _maps(where: np.ndarray) -> torch.Tensor:
+    """Feature maps of one camera, in which a blob stands where it says, in cells."""
+    y, x = np.meshgrid(np.arange(12), np.arange(12), indexing="ij")
+    blob = np.exp(-((x - where[:, 0, None, None]) ** 2 + (y - where[:, 1, None, None]) ** 2) / 2)
+    rng = np.random.default_rng(1)
+    maps = rng.normal(0, 0.1, (len(where), 40, 12, 12))
+    maps[:, 7] += blob
+    return torch.from_numpy(maps).half()
+
+
+@pytest.mark.parametrize("camera", [ft.FRONT, ft.WRIST])
+def test_a_camera_finds_a_thing_at_places_never_seen(camera: str) -> None:
+    rng, n = np.random.default_rng(0), 640
+    tcp, key, width = _poses(rng, n), _poses(rng, n), torch.full((n, 1), 0.08)
+    key[:, 2] = 0.02
+    R = Rotation.from_quat(tcp[:, 3:].numpy(), scalar_first=True)
+    seen = key[:, :2].numpy() - [0.5, 0.0]
+    if camera == ft.WRIST:
+        seen = R.inv().apply((key - tcp)[:, :3].numpy())[:, :2] / 2
+    maps = _maps(seen / 0.2 * 4 + 5.5)[:, None]
+    torch.manual_seed(0)
+    readout = KeyPoseReadout(ImageInputConfig((camera,), (96, 96)))
+    readout.fit(maps[:512], tcp[:512], width[:512], key[:512])
+    optimizer = torch.optim.AdamW(readout.parameters(), 3e-3)
+    for step in range(200):
+        rows = torch.from_numpy(np.random.default_rng(step).choice(512, 64, replace=False))
+        optimizer.zero_grad()
+        readout.loss(maps[rows].float(), tcp[rows], width[rows], key[rows]).backward()
+        optimizer.step()
+    off = readout.error(maps[512:].float(), tcp[512:], width[512:], key[512:])
+    assert off.median() < 0.02  # where guessing the mean place is 0.1 m off
+
+
+def test_poses_turn_into_the_hands_frame_as_scipy_turns_them() -> None:
+    rng = np.random.default_rng(2)
+    tcp, key = _poses(rng, 20), _poses(rng, 20)
+    found = _in_hand_frame(tcp, _columns(key)).numpy()
+    R = Rotation.from_quat(tcp[:, 3:].numpy(), scalar_first=True)
+    np.testing.assert_allclose(found[:, :3], R.inv().apply((key - tcp)[:, :3].numpy()), atol=1e-5)
+    turned = (R.inv() * Rotation.from_quat(key[:, 3:].numpy(), scalar_first=True)).as_matrix()
+    np.testing.assert_allclose(found[:, 3:6], turned[:, :, 0], atol=1e-5)
+    np.testing.assert_allclose(found[:, 6:], turned[:, :, 1], atol=1e-5)
