@@ -29,7 +29,12 @@ from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEnc
 from touchgoal.policies.perception.frozen_images import ImageInputConfig
 from touchgoal.policies.perception.key_pose import KEY_POSE_DIM, KeyPoseReadout
 from touchgoal.policies.perception.novelty import NoveltyDetector
-from touchgoal.policies.perception.proprioception import input_widths, is_position, network_input
+from touchgoal.policies.perception.proprioception import (
+    input_widths,
+    is_motion,
+    is_position,
+    network_input,
+)
 from touchgoal.runtime.errors import UserError
 
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
@@ -290,6 +295,8 @@ class PolicyNetwork(nn.Module):
         columns, kind = self.config.proprioception, self.config.representation
         state = network_input(batch.state, columns, kind)
         state = self.state_normalizer(state).clamp(-_CLIP, _CLIP)
+        if self.key_pose:  # it would repeat its last motion (de Haan et al. 2019), and come to rest
+            state = state * (1 - is_motion(columns, kind)).to(state)
         if noise is not None:
             shift = noise.randn((len(state), 1, state.shape[2])).to(state)
             state = state + self.config.position_noise * shift * is_position(columns, kind).to(

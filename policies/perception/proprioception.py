@@ -50,6 +50,14 @@ def is_position(columns: tuple[str, ...], kind: ActionRepresentation) -> Float[T
     return torch.tensor(marks)
 
 
+def is_motion(columns: tuple[str, ...], kind: ActionRepresentation) -> Float[Tensor, " r"]:
+    """Return 1 for velocities in `network_input`, 0 for the rest."""
+    first, count = (0, 6) if kind == "body_twist" else (ft.N_JOINTS, ft.N_JOINTS)
+    marks = torch.zeros(sum(input_widths(columns, kind)))  # the state comes first
+    marks[first : first + count] = 1.0
+    return marks
+
+
 def network_input(
     state: Float[Tensor, "... s"], columns: tuple[str, ...], kind: ActionRepresentation
 ) -> Float[Tensor, "... r"]:
