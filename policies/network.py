@@ -25,9 +25,9 @@ from touchgoal.policies.heads.diffusion import (
 )
 from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.heads.unet import UNetConfig
+from touchgoal.policies.perception import key_pose as kp
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
 from touchgoal.policies.perception.frozen_images import ImageInputConfig
-from touchgoal.policies.perception.key_pose import KEY_POSE_DIM, KeyPoseReadout
 from touchgoal.policies.perception.novelty import NoveltyDetector
 from touchgoal.policies.perception.proprioception import (
     input_widths,
@@ -166,10 +166,10 @@ class PolicyNetwork(nn.Module):
         if config.end_to_end:
             self.end_to_end_encoder = EndToEndEncoder(config.end_to_end)
             condition_dim += len(ft.TACTILE) * config.end_to_end.width
-        self.key_pose = KeyPoseReadout(config.images) if config.images else None
+        self.key_pose = kp.KeyPoseReadout(config.images) if config.images else None
         watches = config.watches_novelty and config.touch_dim > 0
         self.novelty = NoveltyDetector(config.touch_dim) if watches else None
-        condition_dim += KEY_POSE_DIM if self.key_pose else 0
+        condition_dim += kp.KEY_POSE_DIM if self.key_pose else 0
         self.condition_dim = condition_dim
         if isinstance(config.head, DiffusionConfig):
             self.head = Diffusion(config.head, ticks, ACTION_DIM, condition_dim)
@@ -235,14 +235,17 @@ class PolicyNetwork(nn.Module):
             assert wrench is not None, "needs the wrenches on the pads"
             wrench_loss = F.mse_loss(touch, self.wrench_normalizer(wrench))
             touch = touch.detach()
-        encoded = self._encode(batch, touch, noise)
-        loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
+        pose, sight_loss = self._see(batch), torch.zeros((), device=touch.device)
         if self.key_pose:
             assert batch.maps is not None and key_pose is not None, "needs maps and key poses"
-            loss = loss + self.key_pose.loss(
+            sight_loss = self.key_pose.loss(
                 batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose
             )
-        return loss + wrench_loss
+            if pose is not None and self.config.representation == "body_twist":
+                pose, chunk = kp.set_beside(pose, chunk, noise)
+        encoded = self._encode(batch, touch, pose, noise)
+        loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
+        return loss + wrench_loss + sight_loss
 
     @torch.no_grad()
     def key_pose_error(
@@ -266,12 +269,20 @@ class PolicyNetwork(nn.Module):
 
         The same generator state (on the CPU) gives the same plan.
         """
-        encoded = self._encode(batch, self._encode_touch(batch))
+        encoded = self._encode(batch, self._encode_touch(batch), self._see(batch))
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)
         if self.config.gripper_widths:
             actions[..., -1] = nearest(actions[..., -1], self.config.gripper_widths)
         return actions
+
+    @torch.no_grad()
+    def _see(self, batch: ObservationBatch) -> Float[Tensor, "b 9"] | None:
+        """Return the next key pose in the hand's frame, as the cameras show it."""
+        if not self.key_pose:
+            return None
+        assert batch.maps is not None, "needs the cameras' feature maps"
+        return self.key_pose(batch.maps.float(), *self._hand(batch.state[:, -1]))
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None
@@ -289,6 +300,7 @@ class PolicyNetwork(nn.Module):
         self,
         batch: ObservationBatch,
         touch: Float[Tensor, "b o w"],
+        pose: Float[Tensor, "b 9"] | None,
         noise: BatchNoise | None = None,
     ) -> Float[Tensor, "b c"]:
         """Return the head's whole input, with the training's noise if given."""
@@ -306,7 +318,6 @@ class PolicyNetwork(nn.Module):
         if self.end_to_end_encoder:
             assert batch.pictures is not None, "needs tactile images"
             parts.append(self.end_to_end_encoder(batch.pictures))
-        if self.key_pose:
-            assert batch.maps is not None, "needs the cameras' feature maps"
-            parts.append(self.key_pose(batch.maps.float(), *self._hand(batch.state[:, -1]), noise))
+        if pose is not None:
+            parts.append(kp.features(pose, noise))
         return torch.cat(parts, 1)

@@ -17,7 +17,7 @@ from touchgoal.policies.actions import Normalizer
 from touchgoal.policies.perception.frozen_images import ImageInputConfig, ImageReadout
 from touchgoal.policies.perception.proprioception import rotation_6d
 
-KEY_POSE_DIM = 12  # of `KeyPoseReadout.forward`
+KEY_POSE_DIM = 12  # of `features`
 _POSE = 9  # position, and two columns of the rotation matrix
 _LEVELS = 1e-3  # m between the least and the greatest commanded width: less is one width
 _POSITION, _ROTATION = 0.05, 0.3  # m and rad that weigh alike
@@ -25,6 +25,8 @@ _SMALL = 0.1  # of these, below which an error counts squared
 _NEAR = 0.02  # m, displacements of this size are told apart best
 _NOISE = 0.005  # m and, of the rotation's columns, 1; on what the policy reads in training
 _LEAST, _MOST = -5.0, 3.0  # logarithm of a camera's expected error
+_BESIDE = 0.02, 0.02, 0.01, 0.2  # m along the hand's axes, rad about its z axis
+_BACK = 10  # ticks
 
 
 def next_key_poses(
@@ -39,6 +41,39 @@ def next_key_poses(
     ends = np.cumsum(lengths) - 1
     keys = np.union1d(changes, ends).astype(np.int64)
     return tcp[keys[np.searchsorted(keys, np.arange(len(tcp)))]]
+
+
+def features(pose: Float[Tensor, "b 9"], noise: BatchNoise | None = None) -> Float[Tensor, "b 12"]:
+    """Return a policy's input for the key poses in the hand's frame, with the training's noise if given."""
+    if noise is not None:
+        scale = torch.tensor([_NOISE] * 3 + [_NOISE / _POSITION * _ROTATION] * 6)
+        pose = pose + noise.randn(pose.shape).to(pose) * scale.to(pose)
+    away = pose[:, :3]
+    return torch.cat([away / _POSITION, away / (away.abs() + _NEAR), pose[:, 3:]], 1)
+
+
+def set_beside(
+    pose: Float[Tensor, "b 9"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
+) -> tuple[Float[Tensor, "b 9"], Float[Tensor, "b h 8"]]:
+    """Return half of the key poses and plans ("body_twist") as from a hand beside the recorded one.
+
+    The plans lead it back: recordings hardly show how errors are corrected. Where the gripper changes
+    nothing is moved, so that it changes only in its place.
+    """
+    drawn = noise.randn((len(pose), 4)).to(pose) * torch.tensor(_BESIDE).to(pose)
+    widths = chunk[..., -1]
+    moved = (widths - widths[:, :1]).abs().amax(1) < _LEVELS
+    moved &= noise.rand((len(pose),)).to(pose) < 0.5
+    shift, turn = (drawn * moved[:, None]).split([3, 1], 1)
+    cos, sin, zero = turn.cos(), turn.sin(), torch.zeros_like(turn)
+    rows = torch.cat([cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1], 1)
+    axes = rows.unflatten(1, (3, 3))  # R^T: row vectors times it are turned by `turn` about z
+    there = torch.cat([pose[:, :3] + shift, pose[:, 3:]], 1).unflatten(1, (3, 3)) @ axes
+    back = (torch.arange(1, chunk.shape[1] + 1).to(chunk) / _BACK).clamp(max=1)[:, None]
+    position = (chunk[..., :3] + back * shift[:, None]) @ axes
+    rotation = chunk[..., 3:6] @ axes
+    rotation = torch.cat([rotation[..., :2], rotation[..., 2:] + back * turn[:, None]], 2)
+    return there.flatten(1), torch.cat([position, rotation, chunk[..., 6:]], 2)
 
 
 class KeyPoseReadout(nn.Module):
@@ -81,18 +116,12 @@ class KeyPoseReadout(nn.Module):
         maps: Float[Tensor, "b k c y x"],
         tcp: Float[Tensor, "b 7"],
         width: Float[Tensor, "b 1"],
-        noise: BatchNoise | None = None,
-    ) -> Float[Tensor, "b 12"]:
-        """Return the estimate for a policy, with the training's noise if given."""
+    ) -> Float[Tensor, "b 9"]:
+        """Return the estimate in the hand's frame: position, m, and two columns of the rotation."""
         poses, expected = self._estimates(maps, tcp, width)
         weights = (-2 * expected).softmax(1)  # inverse squares of the expected errors
         weights = weights.repeat_interleave(torch.tensor([3, 6]).to(tcp.device), 2)
-        pose = (weights * poses).sum(1).detach()
-        if noise is not None:
-            scale = torch.tensor([_NOISE] * 3 + [_NOISE / _POSITION * _ROTATION] * 6)
-            pose = pose + noise.randn(pose.shape).to(pose) * scale.to(pose)
-        away = pose[:, :3]
-        return torch.cat([away / _POSITION, away / (away.abs() + _NEAR), pose[:, 3:]], 1)
+        return (weights * poses).sum(1)
 
     def loss(
         self,
@@ -121,8 +150,7 @@ class KeyPoseReadout(nn.Module):
         key: Float[Tensor, "b 7"],
     ) -> Float[Tensor, " b"]:
         """Return how far the estimates are off, m."""
-        away = self(maps, tcp, width)[:, :3] * _POSITION
-        return (away - _in_hand_frame(tcp, _columns(key))[:, :3]).norm(dim=1)
+        return (self(maps, tcp, width) - _in_hand_frame(tcp, _columns(key)))[:, :3].norm(dim=1)
 
     def _estimates(
         self,
