@@ -8,12 +8,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from touchgoal.control import features as ft
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.perception.frozen_images import ImageInputConfig
 from touchgoal.policies.perception.key_pose import (
     KeyPoseReadout,
     _columns,
     _in_hand_frame,
     next_key_poses,
+    set_beside,
 )
 
 
@@ -83,3 +85,24 @@ def test_poses_turn_into_the_hands_frame_as_scipy_turns_them() -> None:
     turned = (R.inv() * Rotation.from_quat(key[:, 3:].numpy(), scalar_first=True)).as_matrix()
     np.testing.assert_allclose(found[:, 3:6], turned[:, :, 0], atol=1e-5)
     np.testing.assert_allclose(found[:, 6:], turned[:, :, 1], atol=1e-5)
+
+
+def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:
+    generator, n, h = torch.Generator().manual_seed(1), 64, 12
+    poses = torch.cat(
+        [torch.randn(n, 3, generator=generator) / 10, torch.eye(3)[:2].flatten().expand(n, 6)], 1
+    )
+    plans = torch.zeros(n, h, 8)
+    plans[..., :3] = torch.linspace(0, 0.05, h)[:, None]
+    plans[: n // 2, h // 2 :, -1] = 0.08  # the gripper opens
+    there, back = set_beside(poses, plans, BatchNoise(generator))
+    torch.testing.assert_close(there[: n // 2], poses[: n // 2])
+    torch.testing.assert_close(back[: n // 2], plans[: n // 2])
+    aside = (there - poses).abs().amax(1) > 0
+    assert 0.3 < aside[n // 2 :].float().mean() < 0.7
+    turn = Rotation.from_rotvec(
+        back[:, -1, 3:6].numpy()
+    )  # from the hand beside to the recorded one
+    left = (poses[:, :3] - plans[:, -1, :3]).numpy()
+    np.testing.assert_allclose(there[:, :3] - back[:, -1, :3], turn.apply(left), atol=1e-6)
+    np.testing.assert_allclose(there[:, 3:6], turn.apply(poses[:, 3:6].numpy()), atol=1e-6)

@@ -6,6 +6,7 @@ from recognises the recordings instead.
 """
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import torch
@@ -107,7 +108,7 @@ class KeyPoseReadout(nn.Module):
     ) -> None:
         """Fit the normalizers to training data."""
         for camera, readout in enumerate(self.readouts):
-            readout.fit(maps[:, camera])
+            cast(ImageReadout, readout).fit(maps[:, camera])
         self.state_normalizer.fit_mean_std(torch.cat([tcp[:, 2:3], width], 1))
         self.place_normalizer.fit_mean_std(key[:, :3])
 
