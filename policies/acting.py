@@ -102,6 +102,7 @@ class LearnedPolicy:
         self._maps: tuple[Observation, Tensor] | None = None  # the latest embedded camera images
         self._recent: list[Observation] = []
         self._novel_plans = 0  # in a row
+        self._width: float | None = None  # of the gripper, where the next plan begins, m
         self._todo: list[np.ndarray] = []  # actions of the present plan
         self._next: list[np.ndarray] = []  # actions of the plan that comes next
 
@@ -136,7 +137,9 @@ class LearnedPolicy:
             pictures, maps = self._difference_images(history[-1]), self._feature_maps(history[-1])
             batch = ObservationBatch(touch, state, pictures, maps)
             self._refuse_novel(batch)
-            return self._network.plan(batch, self._generator)[0].numpy()
+            actions = self._network.plan(batch, self._generator, self._width)[0].numpy()
+            self._width = float(actions[self.config.execution_horizon - 1, -1])
+            return actions
 
     def _refuse_novel(self, batch: ObservationBatch) -> None:
         """Raise RefusedError once touch has been unlike the training for a second of plans."""

@@ -264,16 +264,22 @@ class PolicyNetwork(nn.Module):
         return columns[ft.TCP_POSE], columns[ft.STATE][:, -1:]
 
     @torch.inference_mode()
-    def plan(self, batch: ObservationBatch, generator: torch.Generator) -> Float[Tensor, "b h 8"]:
+    def plan(
+        self, batch: ObservationBatch, generator: torch.Generator, width: float | None = None
+    ) -> Float[Tensor, "b h 8"]:
         """Return actions (`features.ACTION`) of the ticks from the latest observation on.
 
-        The same generator state (on the CPU) gives the same plan.
+        The same generator state (on the CPU) gives the same plan. `width` is the last plan's, m: with
+        cameras the gripper keeps it until the hand is at the next key pose.
         """
-        encoded = self._encode(batch, self._encode_touch(batch), self._see(batch))
+        pose = self._see(batch)
+        encoded = self._encode(batch, self._encode_touch(batch), pose)
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)
         if self.config.gripper_widths:
             actions[..., -1] = nearest(actions[..., -1], self.config.gripper_widths)
+        if pose is not None and width is not None:
+            actions[..., -1] = actions[..., -1].where(kp.reached(pose)[:, None], width)
         return actions
 
     @torch.no_grad()

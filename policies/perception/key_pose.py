@@ -10,7 +10,7 @@ from typing import cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Float32
+from jaxtyping import Bool, Float, Float16, Float32
 from torch import Tensor, nn
 
 from touchgoal.encoders.training.batch_noise import BatchNoise
@@ -28,6 +28,7 @@ _NOISE = 0.005  # m and, of the rotation's columns, 1; on what the policy reads 
 _LEAST, _MOST = -5.0, 3.0  # logarithm of a camera's expected error
 _BESIDE = 0.02, 0.02, 0.01, 0.2  # m along the hand's axes, rad about its z axis
 _BACK = 10  # ticks
+_REACHED = 0.02  # m
 
 
 def next_key_poses(
@@ -51,6 +52,11 @@ def features(pose: Float[Tensor, "b 9"], noise: BatchNoise | None = None) -> Flo
         pose = pose + noise.randn(pose.shape).to(pose) * scale.to(pose)
     away = pose[:, :3]
     return torch.cat([away / _POSITION, away / (away.abs() + _NEAR), pose[:, 3:]], 1)
+
+
+def reached(pose: Float[Tensor, "b 9"]) -> Bool[Tensor, " b"]:
+    """Return whether the hand is at key poses in its frame, as well as sight can tell."""
+    return pose[:, :3].norm(dim=1) < _REACHED
 
 
 def set_beside(
