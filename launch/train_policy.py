@@ -54,6 +54,7 @@ _SIGHT = {
     "cameras": ("front", "wrist"),
     "touch_input": "embedding",
     "trim_pauses": True,
+    "refuse_unknown_touch": False,
     "head": "mlp",
     "action_share": 0.98,
     "train": TrainConfig(epochs=12, batch_size=128, lr=2e-3, warmup=100, snapshot_epochs=4),
@@ -119,6 +120,9 @@ class Config(TrainingOptions):
     touch_input: TouchInput = "wrench"
     """Input from a frozen touch encoder: wrench (a small network trained on the simulator's pad
     forces and torques), or embedding (a projection trained on the actions alone)."""
+    refuse_unknown_touch: bool = True
+    """The policy stops once touch has been unlike all of the training for a second. Of some fifty
+    recordings the limit does not hold: it stops successful runs."""
     touch_projection_dim: Annotated[Count, RARE] = 64
     """Width of that projection, with --touch-input embedding."""
     touch_noise: Annotated[NotNegative, RARE] = 0.1
@@ -244,7 +248,7 @@ def _policy_config(
         touch=touch.name if touch else "",
         touch_input=config.touch_input,
         touch_projection_dim=config.touch_projection_dim,
-        watches_novelty=True,
+        watches_novelty=config.refuse_unknown_touch,
         touch_noise=config.touch_noise,
         position_noise=config.position_noise,
         end_to_end=EndToEndConfig() if config.end_to_end else None,
