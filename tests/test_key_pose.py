@@ -20,18 +20,19 @@ from touchgoal.policies.perception.key_pose import (
 
 
 @pytest.mark.parametrize(
-    ("widths", "lengths", "keys"),
+    ("widths", "lengths", "hold", "keys"),
     [
-        ([0.08, 0.08, 0.0, 0.0, 0.0, 0.08, 0.08], [7], [1, 1, 4, 4, 4, 6, 6]),
-        ([0.08, 0.0, 0.0, 0.08, 0.0, 0.0], [3, 3], [0, 2, 2, 3, 5, 5]),
-        ([0.05, 0.0501, 0.05, 0.0502], [2, 2], [1, 1, 3, 3]),  # noise on one width
+        ([0.08, 0.08, 0.0, 0.0, 0.0, 0.08, 0.08], [7], 0, [1, 1, 4, 4, 4, 6, 6]),
+        ([0.08, 0.0, 0.0, 0.08, 0.0, 0.0], [3, 3], 0, [0, 2, 2, 3, 5, 5]),
+        ([0.08, 0.0, 0.0, 0.0, 0.0, 0.08], [4, 2], 2, [0, 0, 0, 3, 4, 4]),
+        ([0.05, 0.0501, 0.05, 0.0502], [2, 2], 0, [1, 1, 3, 3]),  # noise on one width
     ],
 )
 def test_a_key_pose_is_where_the_gripper_changes_or_the_episode_ends(
-    widths: list[float], lengths: Sequence[int], keys: list[int]
+    widths: list[float], lengths: Sequence[int], hold: int, keys: list[int]
 ) -> None:
     tcp = np.random.default_rng(0).normal(size=(len(widths), 7)).astype(np.float32)
-    found = next_key_poses(tcp, np.array(widths, np.float32), lengths)
+    found = next_key_poses(tcp, np.array(widths, np.float32), lengths, hold)
     np.testing.assert_array_equal(found, tcp[keys])
 
 

@@ -20,6 +20,7 @@ from touchgoal.policies.perception.proprioception import rotation_6d
 
 KEY_POSE_DIM = 12  # of `features`
 _POSE = 9  # position, and two columns of the rotation matrix
+HOLD_SECONDS = 0.5  # s in which the fingers move
 _LEVELS = 1e-3  # m between the least and the greatest commanded width: less is one width
 _POSITION, _ROTATION = 0.05, 0.3  # m and rad that weigh alike
 _SMALL = 0.1  # of these, below which an error counts squared
@@ -32,17 +33,22 @@ _REACHED = 0.02  # m
 
 
 def next_key_poses(
-    tcp: Float32[np.ndarray, "n 7"], widths: Float32[np.ndarray, " n"], lengths: Sequence[int]
+    tcp: Float32[np.ndarray, "n 7"],
+    widths: Float32[np.ndarray, " n"],
+    lengths: Sequence[int],
+    hold: int,
 ) -> Float32[np.ndarray, "n 7"]:
     """Return for every tick the TCP pose at the next change of the commanded width, or at the end.
 
-    `lengths` are the ticks of each episode, one after the other.
+    `lengths` are the ticks of each episode, one after the other. It stays for `hold` ticks after the
+    change: until the fingers have moved, nothing shows that it was commanded.
     """
     closed = widths < (widths.min() + widths.max()) / 2
     changes = np.flatnonzero(np.diff(closed)) if np.ptp(widths) > _LEVELS else []
     ends = np.cumsum(lengths) - 1
     keys = np.union1d(changes, ends).astype(np.int64)
-    return tcp[keys[np.searchsorted(keys, np.arange(len(tcp)))]]
+    until = np.minimum(keys + hold, ends[np.searchsorted(ends, keys)])
+    return tcp[keys[np.searchsorted(until, np.arange(len(tcp)))]]
 
 
 def features(pose: Float[Tensor, "b 9"], noise: BatchNoise | None = None) -> Float[Tensor, "b 12"]:

@@ -16,7 +16,7 @@ from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
 from touchgoal.policies.perception.frozen_images import ImageEmbedder
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
-from touchgoal.policies.perception.key_pose import next_key_poses
+from touchgoal.policies.perception.key_pose import HOLD_SECONDS, next_key_poses
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.runtime.errors import UserError
@@ -75,16 +75,17 @@ def load_recordings(
             pictures.append(_difference_images(episodes, i, config.end_to_end)[start:])
     parts = [torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions)]
     lengths = tuple(len(rows) for rows in actions)
-    key_pose = (
-        next_key_poses(np.concatenate(tcp), parts[2][:, -1].numpy(), lengths) if images else None
-    )
+    key_pose, hold = None, round(HOLD_SECONDS * config.control_hz)
+    if images:
+        widths = parts[2][:, -1].numpy()
+        key_pose = torch.from_numpy(next_key_poses(np.concatenate(tcp), widths, lengths, hold))
     return Recordings(
         *parts,
         lengths=lengths,
         pictures=torch.from_numpy(np.concatenate(pictures)) if config.end_to_end else None,
         wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
         maps=_joined(maps, skip) if images else None,
-        key_pose=None if key_pose is None else torch.from_numpy(key_pose),
+        key_pose=key_pose,
     )
 
 
