@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The policies that the records bead-maze-encoders and bead-maze-seeds judge: the maze by each encoder's
+# The policies that the records bead-maze-encoders, bead-maze-seeds and bead-maze-table judge: the maze by each encoder's
 # frozen embedding (Sparsh's task T5), by the wrench read out of it, and by touch that is learned with the policy;
 # of half of 130 demonstrations, and three of them of all, with three seeds; then the table by data, touch and head.
 # Some six hours of one core, estimated. Stopped, the same line goes on.
@@ -61,8 +61,8 @@ for seed in 0 1 2; do
     policy "maze-all-end-to-end-$seed" --seed "$seed" --end-to-end
 done
 
-# The table by data, touch and head, one seed: a tenth, half and all of the demonstrations. Regression on half and
-# on all is above.
+# The table by data, touch and head (record bead-maze-table): a tenth, half and all of the demonstrations, one seed;
+# diffusion of all three.
 sampled=(--head mlp --sampler.loss absolute --action-share 0.98)
 declare -A touches=(
     [embedding]="--encoder gelsight_mini_markers_mae --touch-input embedding"
@@ -73,8 +73,15 @@ for share in 0.1 0.5 1; do
     for touch in embedding wrench end-to-end; do
         # shellcheck disable=SC2206 # several words
         inputs=(${touches[$touch]} --share "$share")
-        [ "$share" != 0.1 ] || policy "maze-$share-$touch-regression" "${inputs[@]}"
-        policy "maze-$share-$touch-diffusion" "${inputs[@]}" "${sampled[@]}"
-        policy "maze-$share-$touch-flow" "${inputs[@]}" "${sampled[@]}" --sampler.kind flow --sampler.num-inference-steps 4
+        policy "maze-$share-$touch-regression-0" "${inputs[@]}"
+        policy "maze-$share-$touch-diffusion-0" "${inputs[@]}" "${sampled[@]}"
+        policy "maze-$share-$touch-flow-0" "${inputs[@]}" "${sampled[@]}" --sampler.kind flow \
+            --sampler.num-inference-steps 4
+    done
+done
+for seed in 1 2; do
+    for touch in embedding wrench end-to-end; do
+        # shellcheck disable=SC2086
+        policy "maze-1-$touch-diffusion-$seed" --seed "$seed" ${touches[$touch]} "${sampled[@]}"
     done
 done
