@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The policies that the records bead-maze-encoders, bead-maze-seeds and bead-maze-table judge: the maze by each encoder's
+# The policies that the records bead-maze-encoders and bead-maze-seeds judge: the maze by each encoder's
 # frozen embedding (Sparsh's task T5), by the wrench read out of it, and by touch that is learned with the policy;
 # of half of 130 demonstrations, and three of them of all, with three seeds; then the table by data, touch and head.
 # Some six hours of one core, estimated. Stopped, the same line goes on.
@@ -61,7 +61,7 @@ for seed in 0 1 2; do
     policy "maze-all-end-to-end-$seed" --seed "$seed" --end-to-end
 done
 
-# The table by data, touch and head (record bead-maze-table): a tenth, half and all of the demonstrations, one seed;
+# The table by data, touch and head (no record yet): a tenth, half and all of the demonstrations, one seed;
 # diffusion of all three.
 sampled=(--head mlp --sampler.loss absolute --action-share 0.98)
 declare -A touches=(

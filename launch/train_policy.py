@@ -121,8 +121,8 @@ class Config(TrainingOptions):
     """Input from a frozen touch encoder: wrench (a small network trained on the simulator's pad
     forces and torques), or embedding (a projection trained on the actions alone)."""
     refuse_unknown_touch: bool = True
-    """The policy stops once touch has been unlike all of the training for a second. Of some fifty
-    recordings the limit does not hold: it stops successful runs."""
+    """The policy stops once touch has been unlike all of the training for a second. A limit from few
+    recordings also stops good grasps."""
     touch_projection_dim: Annotated[Count, RARE] = 64
     """Width of that projection, with --touch-input embedding."""
     touch_noise: Annotated[NotNegative, RARE] = 0.1

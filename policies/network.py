@@ -23,7 +23,7 @@ from touchgoal.policies.heads.diffusion import (
     DiffusionConfig,
     Regression,
 )
-from touchgoal.policies.heads.mlp import MLPConfig
+from touchgoal.policies.heads.mlp import MLPConfig, readout
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception import key_pose as kp
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
@@ -152,12 +152,8 @@ class PolicyNetwork(nn.Module):
         # narrowed before the U-Net, whose FiLM would multiply the embedding's width
         self.touch_readout, width = None, 0
         if config.reads_wrench:
-            width, hidden = WRENCH_DIM, 256
-            self.touch_readout = nn.Sequential(
-                nn.Linear(config.touch_dim, hidden), nn.Mish(),
-                nn.Linear(hidden, hidden), nn.Mish(),
-                nn.Linear(hidden, width),
-            )  # fmt: skip
+            width = WRENCH_DIM
+            self.touch_readout = readout(config.touch_dim, 256, width)
         elif config.touch_dim:
             width = config.touch_projection_dim
             self.touch_readout = nn.Linear(config.touch_dim, width)
@@ -235,13 +231,13 @@ class PolicyNetwork(nn.Module):
             assert wrench is not None, "needs the wrenches on the pads"
             wrench_loss = F.mse_loss(touch, self.wrench_normalizer(wrench))
             touch = touch.detach()
-        pose, sight_loss = self._see(batch), torch.zeros((), device=touch.device)
+        pose, sight_loss = None, torch.zeros((), device=touch.device)
         if self.key_pose:
             assert batch.maps is not None and key_pose is not None, "needs maps and key poses"
-            sight_loss = self.key_pose.loss(
+            sight_loss, pose = self.key_pose.loss(
                 batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose
             )
-            if pose is not None and self.config.representation == "body_twist":
+            if self.config.representation == "body_twist":
                 pose, chunk = kp.set_beside(pose, chunk, noise)
         encoded = self._encode(batch, touch, pose, noise)
         loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
@@ -270,7 +266,7 @@ class PolicyNetwork(nn.Module):
         """Return actions (`features.ACTION`) of the ticks from the latest observation on.
 
         The same generator state (on the CPU) gives the same plan. `width` is the last plan's, m: with
-        cameras the gripper keeps it until the hand is at the next key pose.
+        cameras a gripper of two widths keeps it until the hand is at the next key pose.
         """
         pose = self._see(batch)
         encoded = self._encode(batch, self._encode_touch(batch), pose)
@@ -278,11 +274,10 @@ class PolicyNetwork(nn.Module):
         actions = to_actions(chunk, batch.joints, self.config.representation)
         if self.config.gripper_widths:
             actions[..., -1] = nearest(actions[..., -1], self.config.gripper_widths)
-        if pose is not None and width is not None:
-            actions[..., -1] = actions[..., -1].where(kp.reached(pose)[:, None], width)
+            if pose is not None and width is not None:
+                actions[..., -1] = actions[..., -1].where(kp.reached(pose)[:, None], width)
         return actions
 
-    @torch.no_grad()
     def _see(self, batch: ObservationBatch) -> Float[Tensor, "b 9"] | None:
         """Return the next key pose in the hand's frame, as the cameras show it."""
         if not self.key_pose:

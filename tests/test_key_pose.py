@@ -1,4 +1,4 @@
-"""The next key pose: labels from recordings, frames, and that sight finds a thing at new places."""
+"""The next key pose: labels from recordings, frames, finding a thing at new places, and what it gates."""
 
 from collections.abc import Sequence
 
@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.batch_noise import BatchNoise
+from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.frozen_images import ImageInputConfig
 from touchgoal.policies.perception.key_pose import (
     KeyPoseReadout,
@@ -71,7 +72,8 @@ def test_a_camera_finds_a_thing_at_places_never_seen(camera: str) -> None:
     for step in range(200):
         rows = torch.from_numpy(np.random.default_rng(step).choice(512, 64, replace=False))
         optimizer.zero_grad()
-        readout.loss(maps[rows].float(), tcp[rows], width[rows], key[rows]).backward()
+        loss, _ = readout.loss(maps[rows].float(), tcp[rows], width[rows], key[rows])
+        loss.backward()
         optimizer.step()
     off = readout.error(maps[512:].float(), tcp[512:], width[512:], key[512:])
     assert off.median() < 0.02  # where guessing the mean place is 0.1 m off
@@ -107,3 +109,30 @@ def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:
     left = (poses[:, :3] - plans[:, -1, :3]).numpy()
     np.testing.assert_allclose(there[:, :3] - back[:, -1, :3], turn.apply(left), atol=1e-6)
     np.testing.assert_allclose(there[:, 3:6], turn.apply(poses[:, 3:6].numpy()), atol=1e-6)
+
+
+def test_the_gripper_changes_only_at_a_key_pose_and_no_velocity_is_read() -> None:
+    images = ImageInputConfig((ft.WRIST,), (96, 96))
+    torch.manual_seed(0)
+    network = PolicyNetwork(
+        PolicyConfig(0, "", images=images, gripper_widths=(0.0, 0.08), representation="body_twist")
+    ).eval()
+    state = torch.randn(4, 2, 22) / 10
+    state[..., 15:] = _poses(np.random.default_rng(0), 8).view(4, 2, 7)
+    batch = ObservationBatch(torch.empty(4, 2, 0), state, maps=torch.randn(4, 1, 40, 12, 12).half())
+
+    def widths(width: float | None) -> torch.Tensor:
+        return network.plan(batch, torch.Generator().manual_seed(0), width)[..., -1]
+
+    assert network.key_pose
+    *_, last = network.key_pose.heads[0].children()
+    assert isinstance(last, torch.nn.Linear)
+    torch.nn.init.zeros_(last.weight)
+    torch.nn.init.zeros_(last.bias)  # at the key pose
+    free = widths(None)
+    assert torch.equal(widths(0.0), free) and torch.equal(widths(0.08), free)
+    last.bias.data[2] = 2.0  # 10 cm away
+    assert (widths(0.0) == 0).all() and (widths(0.08) == 0.08).all()
+    before = network.plan(batch, torch.Generator().manual_seed(0))
+    state[..., 7:14] = 1.0
+    torch.testing.assert_close(network.plan(batch, torch.Generator().manual_seed(0)), before)

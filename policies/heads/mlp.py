@@ -26,6 +26,15 @@ def build_mlp(config: MLPConfig, inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(inputs, outputs))
 
 
+def readout(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    """Return a network with two hidden layers without norm, which reads numbers out of features."""
+    return nn.Sequential(
+        nn.Linear(inputs, width), nn.Mish(),
+        nn.Linear(width, width), nn.Mish(),
+        nn.Linear(width, outputs),
+    )  # fmt: skip
+
+
 class MLPDenoiser(nn.Module):
     """Network from noisy chunk, diffusion step and condition to a chunk of the same shape.
 

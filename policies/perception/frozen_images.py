@@ -82,10 +82,7 @@ def _network() -> EfficientNetLite0:
 
 
 class ImageReadout(nn.Module):
-    """Network from the feature maps of one camera to keypoints, with their features.
-
-    At stride 16, or without the convolution, it finds a block on a table four times less well.
-    """
+    """Network from the feature maps of one camera to keypoints, with their features."""
 
     def __init__(self, config: ImageInputConfig) -> None:
         super().__init__()

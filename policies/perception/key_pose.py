@@ -1,8 +1,7 @@
 """The next key pose: where the hand will be when the gripper next opens or closes, or the task ends.
 
-The recordings hold it (keyframes: James and Davison 2022), and camera images show it. A policy that is
-taught it finds things by sight from fifty demonstrations; one that has only the actions to learn
-from recognises the recordings instead.
+The recordings hold it (keyframes: James and Davison 2022), and camera images show it. Taught it, a
+policy learns where things are; from the actions alone it learns to recognise each recording.
 """
 
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from torch import Tensor, nn
 
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.actions import Normalizer
+from touchgoal.policies.heads.mlp import readout
 from touchgoal.policies.perception.frozen_images import ImageInputConfig, ImageReadout
 from touchgoal.policies.perception.proprioception import rotation_6d
 
@@ -24,7 +24,7 @@ HOLD_SECONDS = 0.5  # s in which the fingers move
 _LEVELS = 1e-3  # m between the least and the greatest commanded width: less is one width
 _POSITION, _ROTATION = 0.05, 0.3  # m and rad that weigh alike
 _SMALL = 0.1  # of these, below which an error counts squared
-_NEAR = 0.02  # m, displacements of this size are told apart best
+_NEAR = 0.02  # m; the second input grows fast below it, and hardly above
 _NOISE = 0.005  # m and, of the rotation's columns, 1; on what the policy reads in training
 _LEAST, _MOST = -5.0, 3.0  # logarithm of a camera's expected error
 _BESIDE = 0.02, 0.02, 0.01, 0.2  # m along the hand's axes, rad about its z axis
@@ -99,17 +99,10 @@ class KeyPoseReadout(nn.Module):
     def __init__(self, config: ImageInputConfig) -> None:
         super().__init__()
         self.on_hand = config.on_hand
-        self.readouts = nn.ModuleList(ImageReadout(config) for _ in config.cameras)
+        self.images = nn.ModuleList(ImageReadout(config) for _ in config.cameras)
         self.state_normalizer, self.place_normalizer = Normalizer((2,)), Normalizer((3,))
-        width, hidden = ImageReadout.width(config) + 2, 128
-        self.heads = nn.ModuleList(
-            nn.Sequential(
-                nn.Linear(width, hidden), nn.Mish(),
-                nn.Linear(hidden, hidden), nn.Mish(),
-                nn.Linear(hidden, _POSE + 2),
-            )
-            for _ in config.cameras
-        )  # fmt: skip
+        width = ImageReadout.width(config) + 2
+        self.heads = nn.ModuleList(readout(width, 128, _POSE + 2) for _ in config.cameras)
 
     def fit(
         self,
@@ -119,8 +112,8 @@ class KeyPoseReadout(nn.Module):
         key: Float[Tensor, "n 7"],
     ) -> None:
         """Fit the normalizers to training data."""
-        for camera, readout in enumerate(self.readouts):
-            cast(ImageReadout, readout).fit(maps[:, camera])
+        for camera, images in enumerate(self.images):
+            cast(ImageReadout, images).fit(maps[:, camera])
         self.state_normalizer.fit_mean_std(torch.cat([tcp[:, 2:3], width], 1))
         self.place_normalizer.fit_mean_std(key[:, :3])
 
@@ -131,10 +124,7 @@ class KeyPoseReadout(nn.Module):
         width: Float[Tensor, "b 1"],
     ) -> Float[Tensor, "b 9"]:
         """Return the estimate in the hand's frame: position, m, and two columns of the rotation."""
-        poses, expected = self._estimates(maps, tcp, width)
-        weights = (-2 * expected).softmax(1)  # inverse squares of the expected errors
-        weights = weights.repeat_interleave(torch.tensor([3, 6]).to(tcp.device), 2)
-        return (weights * poses).sum(1)
+        return _fused(*self._estimates(maps, tcp, width))
 
     def loss(
         self,
@@ -142,10 +132,11 @@ class KeyPoseReadout(nn.Module):
         tcp: Float[Tensor, "b 7"],
         width: Float[Tensor, "b 1"],
         key: Float[Tensor, "b 7"],
-    ) -> Float[Tensor, ""]:
-        """Return the loss of the estimates and of the errors that the cameras expect of them.
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "b 9"]]:
+        """Return the loss of the estimates and of the errors that the cameras expect, and `forward`'s result.
 
-        The latter does not weigh the former (Seitzer et al. 2022): hard images are learned, too.
+        The expected errors do not weigh the estimates (Seitzer et al. 2022): hard images are learned, too.
+        No gradient goes through the result.
         """
         poses, expected = self._estimates(maps, tcp, width)
         off = poses - _in_hand_frame(tcp, _columns(key))[:, None]
@@ -153,7 +144,7 @@ class KeyPoseReadout(nn.Module):
         errors = torch.stack(off, -1)
         errors = torch.where(errors < _SMALL, errors.square() / 2 / _SMALL, errors - _SMALL / 2)
         sureness = errors.detach() * (-expected).exp() + expected
-        return errors.mean() + 0.1 * sureness.mean()
+        return errors.mean() + 0.1 * sureness.mean(), _fused(poses, expected).detach()
 
     def error(
         self,
@@ -174,8 +165,8 @@ class KeyPoseReadout(nn.Module):
         """Return each camera's pose in the hand's frame, and the logarithm of its expected errors."""
         state = self.state_normalizer(torch.cat([tcp[:, 2:3], width], 1))
         poses, expected = [], []
-        for camera, (readout, head) in enumerate(zip(self.readouts, self.heads, strict=True)):
-            found = head(torch.cat([readout(maps[:, camera]), state], 1))
+        for camera, (images, head) in enumerate(zip(self.images, self.heads, strict=True)):
+            found = head(torch.cat([images(maps[:, camera]), state], 1))
             pose, error = found.split([_POSE, 2], 1)
             if self.on_hand[camera]:
                 pose = torch.cat([pose[:, :3] * _POSITION, pose[:, 3:]], 1)
@@ -185,6 +176,11 @@ class KeyPoseReadout(nn.Module):
             poses.append(pose)
             expected.append(error.clamp(_LEAST, _MOST))
         return torch.stack(poses, 1), torch.stack(expected, 1)
+
+
+def _fused(poses: Float[Tensor, "b k 9"], expected: Float[Tensor, "b k 2"]) -> Float[Tensor, "b 9"]:
+    weights = (-2 * expected).softmax(1)  # inverse squares of the expected errors
+    return (weights.repeat_interleave(torch.tensor([3, 6]).to(poses.device), 2) * poses).sum(1)
 
 
 def _columns(pose: Float[Tensor, "b 7"]) -> Float[Tensor, "b 9"]:

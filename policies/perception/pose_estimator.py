@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from touchgoal.control import features as ft
 from touchgoal.policies.actions import Normalizer
 from touchgoal.policies.config import Box, PoseEstimatorConfig
+from touchgoal.policies.heads.mlp import readout
 from touchgoal.policies.perception.keypoints import keypoints
 from touchgoal.policies.perception.target_words import WORDS_WIDTH
 
@@ -69,7 +70,7 @@ class PoseEstimator(nn.Module):
         points = (config.keypoints + config.scene_keypoints) * len(config.crops)
         width = _TCP + points * (2 + config.keypoint_features)
         self.tcp_normalizer, self.start_normalizer = Normalizer((_TCP,)), Normalizer((_START,))
-        self.heads = nn.ModuleList(_head(width, config.width, part) for part in _PARTS)
+        self.heads = nn.ModuleList(readout(width, config.width, part) for part in _PARTS)
 
     def forward(
         self, pictures: Pictures, tcp: Float[Tensor, "b 7"], words: Float[Tensor, "b d"]
@@ -136,14 +137,6 @@ def evenly_lit(pictures: Pictures) -> Pictures:
         rows = [(p * g).clamp_(max=255).to(torch.uint8) for p, g in zip(some, gain, strict=True)]
         lit[key] = torch.stack(rows)
     return lit
-
-
-def _head(inputs: int, width: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(inputs, width), nn.Mish(),
-        nn.Linear(width, width), nn.Mish(),
-        nn.Linear(width, outputs),
-    )  # fmt: skip
 
 
 def _pixels(pictures: UInt8[Tensor, "b h w 3"]) -> Float[Tensor, "b 3 h w"]:
