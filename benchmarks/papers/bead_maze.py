@@ -27,7 +27,7 @@ from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.by_name import follower
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.evaluation import open_loop
-from touchgoal.policies.evaluation.evaluate import Trial, run_trials
+from touchgoal.policies.evaluation.evaluate import REFUSED, Trial, run_trials
 from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import DiffusionConfig
@@ -190,17 +190,17 @@ def _closed_table(results: dict[str, list[Trial]]) -> str:
     width = max(len(name) for name in results) + 2
     lines = [
         f"{'closed loop, test wires':<{width}}{'success [95 % Wilson]':<24}"
-        f"{'completed [95 %]':<22}{'drop':>5}{'jam':>5}{'force':>6}{'peak N':>8}"
+        f"{'completed [95 %]':<22}{'drop':>5}{'jam':>5}{'force':>6}{'refused':>9}{'peak N':>8}"
     ]
     for name, trials in results.items():
         rate = SuccessRate(sum(t.success for t in trials), len(trials))
-        drops, jams, forced = (
-            sum(t.failure == kind for t in trials) for kind in ("drop", "jam", "over_force")
+        drops, jams, forced, refused = (
+            sum(t.failure == kind for t in trials) for kind in ("drop", "jam", "over_force", REFUSED)
         )
         low, high = bootstrap([(str(t.episode["wire"]), t.progress) for t in trials])
         done = f"{np.mean([t.progress for t in trials]):.0%} [{low:.0%}, {high:.0%}]"
         lines.append(
-            f"{name:<{width}}{rate!s:<24}{done:<22}{drops:>5}{jams:>5}{forced:>6}"
+            f"{name:<{width}}{rate!s:<24}{done:<22}{drops:>5}{jams:>5}{forced:>6}{refused:>9}"
             f"{np.median([t.peak_force for t in trials]):>8.1f}"
         )
     return "\n".join(lines)
