@@ -118,7 +118,7 @@ def _put_back(config: Config, connection: "CellConnection", safety: "ActionFilte
     from touchgoal.control.deployment.terminal import Terminal
     from touchgoal.control.teleoperation.teleoperator import Teleoperator
 
-    with closing(_open_device(config, connection, safety)) as device:
+    with closing(_open_device(config, connection, 0)) as device:
         terminal = Terminal(device.press)
         request, show = terminal.operator_request, terminal.show_tick
         loop = ControlLoop(connection, safety, True, request, show)
@@ -147,7 +147,7 @@ def _record(
     from touchgoal.control.teleoperation.teleoperator import Teleoperator
     from touchgoal.launch.support.cell_run import record_episode
 
-    with closing(_open_device(config, connection, safety)) as device:
+    with closing(_open_device(config, connection, cell.task.seed)) as device:
         terminal = Terminal(device.press)
         session = Session(
             cell=cell,
@@ -166,10 +166,8 @@ def _record(
             return session.run()
 
 
-def _open_device(
-    config: Config, connection: "CellConnection", safety: "ActionFilter"
-) -> "TeleoperationDevice":
-    """Return the device, at rest; UserError if there is none."""
+def _open_device(config: Config, connection: "CellConnection", seed: int) -> "TeleoperationDevice":
+    """Return the device, at rest; UserError if there is none. `seed` is that of a script's errors."""
     from touchgoal.control.deployment.scripted import PickPlacePoses
     from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
     from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
@@ -182,7 +180,8 @@ def _open_device(
     layout = connection.truth()["layout"] if connection.truth else {}
     if "grasp" not in layout:
         raise UserError("the scripted device needs a simulated scene of pick-place")
-    return ScriptedDevice(PickPlacePoses(tuple(layout["grasp"]), tuple(layout["goal"])))
+    poses = PickPlacePoses(tuple(layout["grasp"]), tuple(layout["goal"]))
+    return ScriptedDevice(poses, seed)
 
 
 def _save_goal_picture(result: "Result", path: Path) -> None:

@@ -1,7 +1,8 @@
 """Scripted teleoperation device for rehearsals without a person: it picks and places.
 
 A simulator gives it the poses of object and goal. It requests hand motions, as a SpaceMouse does,
-from the observed pose of the hand and width of the gripper.
+from the observed pose of the hand and width of the gripper. As people do, it goes down beside its
+aim and corrects: a policy learns corrections from no other demonstrations (DART, Laskey et al. 2017).
 """
 
 from collections import deque
@@ -17,8 +18,10 @@ from touchgoal.control.motion.rotations import Vector3, fingers_down, rotation_v
 from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, TeleoperationDevice
 
 _SLOW_WITHIN = 0.06, 0.4  # m and rad from a way-point within which the deflection shrinks
-_REACHED = 0.004, 0.03  # m and rad from a way-point
+_REACHED, _PASSED = (0.004, 0.03), (0.012, 0.1)  # m and rad from a way-point
 _CLEARANCE = 0.12  # m above the object
+# On its way down: m above the end, and beside it (standard deviations) m along each axis and rad
+_BESIDE = (_CLEARANCE, 0.02, 0.25), (0.04, 0.008, 0.1)
 _STILL_TICKS = 8  # ticks without motion: the hand has closed, or the table blocks it
 _STILL = 4e-4  # m of position and of width that count as no motion
 _PLACED = 0.015  # m between hand and goal
@@ -28,42 +31,49 @@ _HELD = 0.004  # m of width: less is an empty hand
 class ScriptedDevice(TeleoperationDevice):
     """Goes from way-point to way-point; its verdict is "done" if it ends with an object at the goal."""
 
-    def __init__(self, poses: PickPlacePoses) -> None:
-        self._poses = poses
+    def __init__(self, poses: PickPlacePoses, seed: int) -> None:
+        self._poses, self._rng = poses, np.random.default_rng(seed)
         self._recent: deque[np.ndarray] = deque(maxlen=_STILL_TICKS)  # position and width, m
-        self._R = fingers_down(poses.grasp[3])
         self._motions = self._run()
 
     def read(self, observation: Observation) -> HandMotion:
         """Return the motion to the present way-point."""
         pose = observation[ft.TCP_POSE].astype(np.float64)
         self._position, self._width = pose[:3], float(observation[ft.STATE][-1])
-        R = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix()
-        self._error = rotation_vector(self._R @ R.T)
+        self._R = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix()
         self._recent.append(np.append(self._position, self._width))
         return next(self._motions)
 
     def _run(self) -> Iterator[HandMotion]:
         x, y, z, _ = self._poses.grasp
-        pick, put, up = np.array([x, y, z]), np.array([*self._poses.goal, z]), [0, 0, _CLEARANCE]
-        yield from self._go(pick + up, "open")
-        yield from self._go(pick, "open")
+        pick, put = np.array([x, y, z]), np.array([*self._poses.goal, z])
+        yield from self._go_down(pick, "open")
         yield from self._wait("close")
-        for point in (pick + up, put + up, put):
-            yield from self._go(point, "close")
+        yield from self._go(pick + [0, 0, _CLEARANCE], 0.0, "close", _REACHED)
+        yield from self._go_down(put, "close")
         yield from self._wait("close")
         there = np.linalg.norm((self._position - put)[:2]) < _PLACED and self._width > _HELD
         self.verdict = "done" if there else "not done"
         while True:
             yield HandMotion(np.zeros(6), "close")
 
-    def _go(self, point: Vector3, gripper: GripperRequest) -> Iterator[HandMotion]:
+    def _go_down(self, point: Vector3, gripper: GripperRequest) -> Iterator[HandMotion]:
+        for height, away, turn in _BESIDE:
+            beside = np.append(self._rng.normal(0, away, 2), height)
+            yield from self._go(point + beside, self._rng.normal(0, turn), gripper, _PASSED)
+        yield from self._go(point, 0.0, gripper, _REACHED)
+
+    def _go(
+        self, point: Vector3, turn: float, gripper: GripperRequest, near: tuple[float, float]
+    ) -> Iterator[HandMotion]:
+        """Go to a way-point, turned by `turn` (rad) from the grasp, until so near it (m, rad) or blocked."""
         self._recent.clear()
+        aim = fingers_down(self._poses.grasp[3] + turn)
         while not self._stands():
-            away = point - self._position
-            if np.linalg.norm(away) < _REACHED[0] and np.linalg.norm(self._error) < _REACHED[1]:
+            away, error = point - self._position, rotation_vector(aim @ self._R.T)
+            if np.linalg.norm(away) < near[0] and np.linalg.norm(error) < near[1]:
                 return
-            shares = (_limited(away / _SLOW_WITHIN[0]), _limited(self._error / _SLOW_WITHIN[1]))
+            shares = (_limited(away / _SLOW_WITHIN[0]), _limited(error / _SLOW_WITHIN[1]))
             yield HandMotion(np.concatenate(shares), gripper)
 
     def _wait(self, gripper: GripperRequest) -> Iterator[HandMotion]:
