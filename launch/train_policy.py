@@ -57,6 +57,7 @@ _SIGHT = {
     "refuse_unknown_touch": False,
     "head": "mlp",
     "action_share": 0.98,
+    "execution_horizon": 6,
     "train": TrainConfig(epochs=12, batch_size=128, lr=2e-3, warmup=100, snapshot_epochs=4),
     "sampler": SamplerConfig(loss="absolute"),
 }

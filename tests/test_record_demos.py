@@ -14,16 +14,19 @@ import numpy as np
 import pytest
 from fake_cell import write_cell_file
 from in_process import run
+from scipy.spatial.transform import Rotation
 
 from touchgoal.control import features as ft
+from touchgoal.control.deployment.scripted import PickPlacePoses
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.motion.kinematics import Kinematics
-from touchgoal.control.motion.rotations import rotation_vector
+from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import HandMotion, TeleoperationDevice
 from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
+from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
 from touchgoal.control.teleoperation.teleoperator import Teleoperator
 from touchgoal.episodes.store import EpisodeSet
@@ -187,6 +190,24 @@ def test_own_demonstrations_train_a_policy_that_deploys(
     assert EpisodeSet(tmp_path / "run" / "episodes").meta(0)["task"] == "put it down"
     with pytest.raises(SystemExit, match="was trained for put it down, not for pick-place"):
         run(*deploying, "--task", "pick-place")
+
+
+def test_the_script_errs_on_its_way_down_and_corrects() -> None:
+    ends = np.array([[0.5, 0.1], [0.4, -0.1]])  # of block and disc
+    for seed in (0, 1):
+        device = ScriptedDevice(PickPlacePoses((*ends[0], 0.02, 0.3), tuple(ends[1])), seed)
+        position, R, width, way = np.array([0.45, 0.0, 0.25]), fingers_down(0.0), 0.08, []
+        while not device.verdict:
+            pose = np.append(position, Rotation.from_matrix(R).as_quat(scalar_first=True))
+            motion = device.read({ft.TCP_POSE: pose, ft.STATE: np.array([width])})
+            position = position + 0.01 * motion.twist[:3]
+            R = rotation_matrix(0.05 * motion.twist[3:]) @ R
+            width = {"open": 0.08, "close": 0.03}[motion.gripper]
+            way.append([*position, width])
+        x_y, z, width = np.split(np.array(way), [2, 3], 1)
+        np.testing.assert_allclose(x_y[(width < 0.05)[:, 0]][[0, -1]], ends, atol=0.005)
+        low = np.abs(z[:, 0] - 0.05) < 0.01
+        assert np.abs(x_y[low, None] - ends).max(2).min(1).max() > 0.003
 
 
 def test_a_person_leads_the_arm_by_keys(tmp_path: Path) -> None:

@@ -195,7 +195,8 @@ def _closed_table(results: dict[str, list[Trial]]) -> str:
     for name, trials in results.items():
         rate = SuccessRate(sum(t.success for t in trials), len(trials))
         drops, jams, forced, refused = (
-            sum(t.failure == kind for t in trials) for kind in ("drop", "jam", "over_force", REFUSED)
+            sum(t.failure == kind for t in trials)
+            for kind in ("drop", "jam", "over_force", REFUSED)
         )
         low, high = bootstrap([(str(t.episode["wire"]), t.progress) for t in trials])
         done = f"{np.mean([t.progress for t in trials]):.0%} [{low:.0%}, {high:.0%}]"
