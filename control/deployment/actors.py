@@ -15,6 +15,7 @@ from touchgoal.control.deployment.user_policy import find_user_policy
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.tracker import ServoLag
 from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.teleoperation.yielding_actor import YieldingActor
 from touchgoal.runtime.errors import UserError
 
 _SIMULATED_PLAN_TIMEOUT = 20.0  # s of wall time that a simulated arm waits for a plan
@@ -78,9 +79,12 @@ def make_actor(
     if policy is not None:
         # Waiting makes a run on a simulated arm repeatable on any machine.
         timeout = _SIMULATED_PLAN_TIMEOUT if cell.time_waits else None
-        # Demonstrations of a task of one's own are recorded as they are deployed, without that lag.
-        lag = None if cell.task.own else ServoLag(safety.limits, safety.dt)
-        return RealTimeActor(policy.planner, timeout, lag)
+        if (
+            cell.task.own
+        ):  # acts as its demonstrations were led: without lag, with a hand that yields
+            actor = RealTimeActor(policy.planner, timeout)
+            return YieldingActor(actor, safety, commanded)
+        return RealTimeActor(policy.planner, timeout, ServoLag(safety.limits, safety.dt))
     if cell.task.policy == "follower":
         return WireFollower(ft.CONTROL_HZ)
     return pick_and_place(_pick_place_poses(cell, truth), safety, commanded)

@@ -11,15 +11,12 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
+from touchgoal.control.motion.compliance import Compliance
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import TeleoperationDevice
-
-# N and Nm beyond the first reading that count as none: the weight of a carried object, and the drift
-# of an arm's own estimate.
-_FREE_FORCE, _FREE_TORQUE = 3.0, 0.3
 
 
 class Teleoperator(Actor):
@@ -36,31 +33,24 @@ class Teleoperator(Actor):
         self._device, self._commanded, self._config = device, commanded, config
         self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
         self._widths = {"close": safety.limits.tool.stroke[0], "open": safety.limits.tool.stroke[1]}
+        self._compliance = Compliance(config.compliance, config.rotational_compliance)
         self._dt = safety.dt
 
     def start(self, observation: Observation) -> None:
         """Take the first wrench as that of the free hand, and the gripper's width as its target."""
-        self._at_rest = observation[ft.WRENCH].astype(np.float64)
+        self._compliance.start(observation)
         self._width = float(observation[ft.STATE][-1])
 
     def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
         """Return the action for the next tick; joints stand where the arm cannot follow."""
         motion, config, q = self._device.read(observation), self._config, self._commanded()
         self._width = self._widths.get(motion.gripper, self._width)
-        added = (observation[ft.WRENCH] - self._at_rest).reshape(2, 3)
-        moved = config.speed * motion.twist[:3]
-        moved = moved + config.compliance * _beyond(added[0], _FREE_FORCE)
-        turned = config.turn_speed * motion.twist[3:]
-        turned = turned + config.rotational_compliance * _beyond(added[1], _FREE_TORQUE)
+        yielded = self._compliance.velocity(observation)
+        moved = config.speed * motion.twist[:3] + yielded[:3]
+        turned = config.turn_speed * motion.twist[3:] + yielded[3:]
         if not moved.any() and not turned.any():
             return np.append(np.zeros(q.size), self._width)
         position, R = self._kinematics.forward(q)
         R = rotation_matrix(self._dt * turned) @ R
         solved = self._kinematics.solve_ik_near(position + self._dt * moved, R, q)
         return np.append(solved.q - q if solved.reached else np.zeros(q.size), self._width)
-
-
-def _beyond(vector: Float[np.ndarray, "3"], free: float) -> Float[np.ndarray, "3"]:
-    """Return a vector shortened by `free`; NaN, as near an arm's singularity, counts as none."""
-    length = float(np.linalg.norm(vector))
-    return vector * (1 - free / length) if length > free else np.zeros(3)
