@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -38,6 +39,7 @@ from touchgoal.policies.perception.proprioception import (
 from touchgoal.runtime.errors import UserError
 
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
+_DRAWS = 8  # of the noise, for each window that is seen: seeing is most of a training step's work
 NOVEL_SECONDS = 1.0  # s for which novelty must last to count
 _CLIP = 5.0  # standard deviations
 
@@ -224,21 +226,25 @@ class PolicyNetwork(nn.Module):
 
         With `reads_wrench` it needs the wrenches on both pads, with cameras the next key poses.
         """
+        pose, sight_loss = None, torch.zeros((), device=actions.device)
+        if self.key_pose:
+            assert batch.maps is not None and key_pose is not None, "needs maps and key poses"
+            sight_loss, pose = self.key_pose.loss(
+                batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose
+            )
+            touch, state, pictures, pose, actions, wrench, action_is_pad = _repeated(
+                batch.touch, batch.state, batch.pictures, pose, actions, wrench, action_is_pad
+            )
+            batch = ObservationBatch(touch, state, pictures)
         chunk = to_representation(actions, batch.joints, self.config.representation)
+        if pose is not None and self.config.representation == "body_twist":
+            pose, chunk = kp.set_beside(pose, chunk, noise)
         touch = self._encode_touch(batch, noise)
         wrench_loss = torch.zeros((), device=touch.device)
         if self.config.reads_wrench:
             assert wrench is not None, "needs the wrenches on the pads"
             wrench_loss = F.mse_loss(touch, self.wrench_normalizer(wrench))
             touch = touch.detach()
-        pose, sight_loss = None, torch.zeros((), device=touch.device)
-        if self.key_pose:
-            assert batch.maps is not None and key_pose is not None, "needs maps and key poses"
-            sight_loss, pose = self.key_pose.loss(
-                batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose
-            )
-            if self.config.representation == "body_twist":
-                pose, chunk = kp.set_beside(pose, chunk, noise)
         encoded = self._encode(batch, touch, pose, noise)
         loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
         return loss + wrench_loss + sight_loss
@@ -322,3 +328,8 @@ class PolicyNetwork(nn.Module):
         if pose is not None:
             parts.append(kp.features(pose, noise))
         return torch.cat(parts, 1)
+
+
+def _repeated(*rows: Tensor | None) -> list[Any]:
+    """Return every row `_DRAWS` times."""
+    return [None if x is None else x.repeat_interleave(_DRAWS, 0) for x in rows]
