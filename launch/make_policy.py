@@ -167,7 +167,7 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     touch = out / "touch" if config.learn_touch else config.touch
     learn = shlex.split(  # with two observed ticks the bead arrived less often on validation wires
         "--representation body_twist --arm-state commanded --train.lr 1e-3 --env.start-angle 10 "
-        "--task bead-maze --observation-horizon 4 --train.snapshot-epochs 5"
+        "--task bead-maze --observation-horizon 4 --train.snapshot-epochs 5 --refuse-unknown-touch"
     )
     learn += ["--encoder", str(touch / "encoder") if touch else _MAZE_TOUCH]
     learn += ["--touch-input", "wrench" if config.wrench else "embedding"]

@@ -53,12 +53,12 @@ _PAPER = {
 _SIGHT = {
     "cameras": ("front", "wrist"),
     "touch_input": "embedding",
+    "touch_noise": 1.0,
     "trim_pauses": True,
-    "refuse_unknown_touch": False,
     "head": "mlp",
     "action_share": 0.98,
     "execution_horizon": 6,
-    "train": TrainConfig(epochs=12, batch_size=128, lr=2e-3, warmup=100, snapshot_epochs=4),
+    "train": TrainConfig(epochs=12, batch_size=32, lr=1e-3, warmup=300, snapshot_epochs=4),
     "sampler": SamplerConfig(loss="absolute"),
 }
 
@@ -121,9 +121,10 @@ class Config(TrainingOptions):
     touch_input: TouchInput = "wrench"
     """Input from a frozen touch encoder: wrench (a small network trained on the simulator's pad
     forces and torques), or embedding (a projection trained on the actions alone)."""
-    refuse_unknown_touch: bool = True
-    """The policy stops once touch has been unlike all of the training for a second. A limit from few
-    recordings also stops good grasps."""
+    refuse_unknown_touch: bool = False
+    """The policy stops once touch has been unlike all of the training for a second. For episodes in
+    which an expert corrected a policy (make-policy): a limit from demonstrations alone also stops a
+    third of the good runs."""
     touch_projection_dim: Annotated[Count, RARE] = 64
     """Width of that projection, with --touch-input embedding."""
     touch_noise: Annotated[NotNegative, RARE] = 0.1
