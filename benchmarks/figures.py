@@ -36,11 +36,11 @@ def each_row(metrics: Metrics) -> str:
 
 
 def maze(metrics: Metrics, **names: str) -> str:
-    """Success of closed-loop rows, by label and a part of the row's name."""
-    found = []
+    """Success of closed-loop rows, by label and the row's name or a part that no other has."""
+    found, rows = [], metrics["closed_loop"]
     for label, part in names.items():
-        [own] = [trials for key, trials in metrics["closed_loop"].items() if part in key]
-        found.append(f"{label} {_rate(own)}")
+        [own] = [part] if part in rows else [name for name in rows if part in name]
+        found.append(f"{label} {_rate(rows[own])}")
     return "; ".join(found)
 
 

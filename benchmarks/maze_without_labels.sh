@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# The policies that the records bead-maze-encoders and bead-maze-seeds judge: the maze by each encoder's
-# frozen embedding (Sparsh's task T5), by the wrench read out of it, and by touch that is learned with the policy;
-# of half of 130 demonstrations, and three of them of all, with three seeds; then the table by data, touch and head.
-# Some six hours of one core, estimated. Stopped, the same line goes on.
+# The policies that the records bead-maze-encoders, -seeds, -embedding, -wrench and -learned judge: the maze by each
+# encoder's frozen embedding (Sparsh's task T5), by the wrench read out of it, and by touch that is learned with the
+# policy; of half of 130 demonstrations, and three of them of all, with three seeds; then the table by data, touch
+# and head. Some six hours of one core, estimated. Stopped, the same line goes on.
 set -eu
 
 demos() { # name, options
@@ -61,8 +61,8 @@ for seed in 0 1 2; do
     policy "maze-all-end-to-end-$seed" --seed "$seed" --end-to-end
 done
 
-# The table by data, touch and head (no record yet): a tenth, half and all of the demonstrations, one seed;
-# diffusion of all three.
+# The table by data, touch and head (records bead-maze-embedding, -wrench and -learned): a tenth, half and all of
+# the demonstrations, one seed; of all of them diffusion, and on the embedding every head, with three.
 sampled=(--head mlp --sampler.loss absolute --action-share 0.98)
 declare -A touches=(
     [embedding]="--encoder gelsight_mini_markers_mae --touch-input embedding"
@@ -84,4 +84,9 @@ for seed in 1 2; do
         # shellcheck disable=SC2086
         policy "maze-1-$touch-diffusion-$seed" --seed "$seed" ${touches[$touch]} "${sampled[@]}"
     done
+    # shellcheck disable=SC2206
+    inputs=(${touches[embedding]} --seed "$seed")
+    policy "maze-1-embedding-regression-$seed" "${inputs[@]}"
+    policy "maze-1-embedding-flow-$seed" "${inputs[@]}" "${sampled[@]}" --sampler.kind flow \
+        --sampler.num-inference-steps 4
 done
