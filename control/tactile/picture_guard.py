@@ -25,7 +25,7 @@ from touchgoal.runtime.errors import UserError
 
 # Thresholds lie between what whole pictures and faulty ones reach, on the real frames of three
 # Minis and two DIGITs (tests/measure_picture_guard.py prints the table).
-_SEAM, _STEP = 9.0, 6.0  # times the usual step from row to row; counts, the channels' sum
+_SEAM, _STEP = 3.5, 6.0  # times the usual step from row to row; counts, the channels' sum
 _EDGE = 10  # share of a picture (1/n) at either end where a seam may be the sensor's case
 _SEAM_PARTS = 32  # along a row, half of which must show the step
 _CLEARLY = 0.85  # share of the difference that a better order or mirror may leave
@@ -92,9 +92,8 @@ def find_seam(picture: Picture) -> str:
             return ""
         size = (_SEAM_PARTS, count)
         light = cv2.resize(lines.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        step = np.abs(np.diff(light, axis=0)).sum(2)
-        # A pressed edge is blurred over several rows by the gel.
-        jump = np.maximum(step[1:-1] - np.maximum(step[:-2], step[2:]), 0)
+        step = np.diff(light, axis=0)
+        jump = np.abs(step[1:-1] - (step[:-2] + step[2:]) / 2).sum(2)
         usual = np.median(jump, 1)[margin:-margin]
         if usual.max() > max(_SEAM * np.quantile(usual, 0.95), _STEP):
             at = int(usual.argmax()) + margin + 2
