@@ -15,7 +15,7 @@ from touchgoal.control.calibration.ball import press_surface
 from touchgoal.control.features import TACTILE
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.sensors.tactile_camera import NO_CROP, TactileCamera
-from touchgoal.control.tactile.picture_guard import check_presses, check_untouched
+from touchgoal.control.tactile.picture_guard import check_presses, check_untouched, find_seam
 from touchgoal.control.tactile.sensor_calibration import load, save, shade
 from touchgoal.control.tactile.sensor_models import (
     DIGIT,
@@ -27,7 +27,10 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.config import NO_RANDOMIZATION
+from touchgoal.sim_envs.scene.objects import find, sample_body
 from touchgoal.sim_envs.tactile.optics import render_untouched
+from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
 REAL = Path(__file__).parents[2] / "shared" / "data"  # beside the project; not part of it
@@ -117,6 +120,20 @@ def test_presses_tell_a_mirror_that_the_untouched_gel_does_not_show(tmp_path: Pa
     check_untouched(untouched, model, "the picture")
     with pytest.raises(UserError, match="mirrored left to right"):
         check_presses(untouched, presses, model, "the presses")
+
+
+def test_a_pressed_edge_is_no_tear() -> None:
+    block = sample_body(find("wooden_block"), np.random.default_rng(0), mass=0.05)
+    gel = sample_instance(GELSIGHT_MINI, np.random.default_rng(0), NO_RANDOMIZATION)
+    untouched, stepped = render_untouched(gel, np.random.default_rng(0)), 0
+    for y in np.arange(-0.0215, -0.0155, 0.0008):  # m; an edge lies across the pad, along its rows
+        bench = PressBench(block, GELSIGHT_MINI, gel)
+        bench.place(np.array([0.0, y, 0.03]), None)
+        picture = bench.sense(40.0, np.random.default_rng(1), centre=(0.0, 0.0)).image
+        stepped += bool(find_seam(picture))
+        assert not find_seam(picture, untouched)
+    assert stepped
+    assert "row" in find_seam(torn(untouched), untouched)
 
 
 def test_a_fingertip_leaves_out_torn_pictures() -> None:

@@ -58,7 +58,8 @@ class TactileCamera:
         raw = self._camera.read()
         if self._raw is not raw:
             frame = replace(raw, image=crop_to_sensor(raw.image, self._model, self._crop))
-            self._raw, self._torn = raw, find_seam(frame.image)
+            before = self._whole.image if self._whole else None
+            self._raw, self._torn = raw, find_seam(frame.image, before)
             if not self._torn:
                 self._whole = frame
         if self._whole is None:
