@@ -25,7 +25,6 @@ _BESIDE = (_CLEARANCE, 0.02, 0.25), (0.04, 0.008, 0.1)
 _STILL_TICKS = 8  # ticks without motion: the hand has closed, or the table blocks it
 _STILL = 4e-4  # m of position and of width that count as no motion
 _PLACED = 0.015  # m between hand and goal
-_PRESSED = 0.008  # m below the grasp's height to which it puts down; the table blocks it
 _HELD = 0.004  # m of width: less is an empty hand
 
 
@@ -52,7 +51,6 @@ class ScriptedDevice(TeleoperationDevice):
         yield from self._wait("close")
         yield from self._go(pick + [0, 0, _CLEARANCE], 0.0, "close", _REACHED)
         yield from self._go_down(put, "close")
-        yield from self._go(put - [0, 0, _PRESSED], 0.0, "close", _REACHED)
         there = np.linalg.norm((self._position - put)[:2]) < _PLACED and self._width > _HELD
         yield from self._wait("open")
         yield from self._go(put + [0, 0, _CLEARANCE], 0.0, "open", _PASSED)
