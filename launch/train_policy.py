@@ -123,8 +123,8 @@ class Config(TrainingOptions):
     forces and torques), or embedding (a projection trained on the actions alone)."""
     refuse_unknown_touch: bool = False
     """The policy stops once touch has been unlike all of the training for a second. For episodes in
-    which an expert corrected a policy (make-policy): a limit from demonstrations alone also stops two
-    good runs of five."""
+    which an expert corrected a policy (make-policy): a limit from demonstrations alone also stops
+    good runs."""
     touch_projection_dim: Annotated[Count, RARE] = 64
     """Width of that projection, with --touch-input embedding."""
     touch_noise: Annotated[NotNegative, RARE] = 0.1

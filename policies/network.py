@@ -39,7 +39,7 @@ from touchgoal.policies.perception.proprioception import (
 from touchgoal.runtime.errors import UserError
 
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
-_DRAWS = 8  # of the noise, for each window that is seen: seeing is most of a training step's work
+_DRAWS = 8  # of the noise, for each window that is seen: sight is most of a training step's work
 NOVEL_SECONDS = 1.0  # s for which novelty must last to count
 _CLIP = 5.0  # standard deviations
 
@@ -232,9 +232,9 @@ class PolicyNetwork(nn.Module):
             sight_loss, pose = self.key_pose.loss(
                 batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose
             )
-            touch, state, pictures, pose, actions, wrench, action_is_pad = _repeated(
-                batch.touch, batch.state, batch.pictures, pose, actions, wrench, action_is_pad
-            )
+            draws = 1 if self.end_to_end_encoder else _DRAWS
+            rows = batch.touch, batch.state, batch.pictures, pose, actions, wrench, action_is_pad
+            touch, state, pictures, pose, actions, wrench, action_is_pad = _repeated(rows, draws)
             batch = ObservationBatch(touch, state, pictures)
         chunk = to_representation(actions, batch.joints, self.config.representation)
         if pose is not None and self.config.representation == "body_twist":
@@ -330,6 +330,6 @@ class PolicyNetwork(nn.Module):
         return torch.cat(parts, 1)
 
 
-def _repeated(*rows: Tensor | None) -> list[Any]:
-    """Return every row `_DRAWS` times."""
-    return [None if x is None else x.repeat_interleave(_DRAWS, 0) for x in rows]
+def _repeated(tensors: Sequence[Tensor | None], times: int) -> list[Any]:
+    """Return tensors with every row repeated, those that are None as they are."""
+    return [None if x is None else x.repeat_interleave(times, 0) for x in tensors]

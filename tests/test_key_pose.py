@@ -1,4 +1,4 @@
-"""The next key pose: labels from recordings, frames, finding a thing at new places, and what it gates."""
+"""The next key pose: its labels, its frame, places never recorded, and when the gripper may change."""
 
 from collections.abc import Sequence
 

@@ -79,11 +79,8 @@ def make_actor(
     if policy is not None:
         # Waiting makes a run on a simulated arm repeatable on any machine.
         timeout = _SIMULATED_PLAN_TIMEOUT if cell.time_waits else None
-        if (
-            cell.task.own
-        ):  # acts as its demonstrations were led: without lag, with a hand that yields
-            actor = RealTimeActor(policy.planner, timeout)
-            return YieldingActor(actor, safety, commanded)
+        if cell.task.own:  # its demonstrations were led without that lag, by a hand that yields
+            return YieldingActor(RealTimeActor(policy.planner, timeout), safety, commanded)
         return RealTimeActor(policy.planner, timeout, ServoLag(safety.limits, safety.dt))
     if cell.task.policy == "follower":
         return WireFollower(ft.CONTROL_HZ)

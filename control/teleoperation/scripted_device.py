@@ -29,7 +29,7 @@ _HELD = 0.004  # m of width: less is an empty hand
 
 
 class ScriptedDevice(TeleoperationDevice):
-    """Goes from way-point to way-point; its verdict is "done" if it ends with an object at the goal."""
+    """Goes from way-point to way-point; its verdict is "done" if it let an object go at the goal."""
 
     def __init__(self, poses: PickPlacePoses, seed: int) -> None:
         self._poses, self._rng = poses, np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""A policy's actor with the hand that yields of the demonstrations, for a task of one's own."""
+"""An actor whose hand yields to what it presses on, as the led hand of demonstrations does."""
 
 from collections.abc import Callable
 

@@ -1,7 +1,7 @@
 """The next key pose: where the hand will be when the gripper next opens or closes, or the task ends.
 
 The recordings hold it (keyframes: James and Davison 2022), and camera images show it. Taught it, a
-policy learns where things are; from the actions alone it learns to recognise each recording.
+policy learns where things are; trained on the actions alone, it memorises the recordings.
 """
 
 from collections.abc import Sequence
