@@ -34,6 +34,7 @@ from touchgoal.encoders.alignment.config import AlignConfig
 from touchgoal.encoders.alignment.splits import Fold
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import load_towers
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
@@ -76,7 +77,7 @@ class Config(BenchmarkOptions):
     picture_rows: Count = 112
     """Rows of their pictures, px."""
     device: str = "cpu"
-    """Device of their training, as torch names it: cpu, cuda."""
+    """Device of all trainings, as torch names it: cpu, cuda."""
     cache: Path = Path("runs/mmwand-embeddings")
     """Folder that keeps the embeddings."""
     seed: Seed = 0
@@ -107,13 +108,15 @@ def run(config: Config) -> dict[str, Any]:
 def _trained(config: Config, data: EmbeddedSet) -> list[dict[str, Any]]:
     if not config.trained:
         return []
+    options = TrainerOptions(seed=config.seed, device=config.device)
+    check_device(config.device)
     towers, rows = load_towers("offline"), []
     touches = read_touch_data(WandSet.open(config.data), towers)
     for split in config.splits:
         fold = data.fold(split, config.seed)
         for backbone in config.trained:
             align = AlignConfig(backbone=backbone, epochs=config.trained_epochs)
-            encoder = train(touches, fold, data.sensor, towers, align, config.seed)
+            encoder = train(touches, fold, data.sensor, towers, align, options)
             embedding = embed_touches(encoder, touches)
             found = _judge(data.label, embedding, [fold])
             rows.append({"split": split, "input": f"{backbone} trained", **found})

@@ -35,6 +35,8 @@ from touchgoal.encoders.alignment.retrieval import average_precisions
 from touchgoal.encoders.alignment.splits import SPLITS, Fold
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import Towers, load_towers
+from touchgoal.encoders.training.options import TrainerOptions
+from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.rewards.report.text_table import aligned
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
@@ -71,6 +73,8 @@ class Config(BenchmarkOptions):
     each; slow."""
     epochs: Count = 20
     """Passes of their training over the touches."""
+    device: str = "cpu"
+    """Device of their training, as torch names it: cpu, cuda."""
     cache: Path = Path("runs/mmwand-embeddings")
     """Folder that keeps the embeddings."""
     seed: Seed = 0
@@ -128,12 +132,13 @@ def _judges_that_train(config: Config) -> dict[str, Callable[[EmbeddedSet, Fold,
     """Return the rows whose backbones are trained; the touches are read only if there are any."""
     if not config.trained:
         return {}
+    check_device(config.device)
     towers = load_towers("offline")
     touches, rows = read_touch_data(WandSet.open(config.data), towers), {}
     for backbone, weight in product(config.trained, (1.0, 0.0)):
         align = AlignConfig(backbone=backbone, epochs=config.epochs, text_weight=weight)
         without = "" if weight else ", without touch-text"
-        rows[f"{backbone} trained{without}"] = partial(_trained, touches, towers, align)
+        rows[f"{backbone} trained{without}"] = partial(_trained, touches, towers, align, config.device)
     return rows
 
 
@@ -141,12 +146,15 @@ def _trained(
     touches: TouchData,
     towers: Towers,
     config: AlignConfig,
+    device: str,
     data: EmbeddedSet,
     fold: Fold,
     seed: int,
 ) -> Found:
     """Judge an encoder whose backbone is trained on the training side as well."""
-    encoder = train(touches, fold, data.sensor, towers, config, seed)
+    encoder = train(
+        touches, fold, data.sensor, towers, config, TrainerOptions(seed=seed, device=device)
+    )
     return judge(data, fold, embed_fold(encoder, touches, fold))
 
 

@@ -38,13 +38,21 @@ def read_touch_data(data: WandSet, towers: Towers) -> TouchData:
 
 
 def train(
-    data: TouchData, fold: Fold, sensor: str, towers: Towers, config: AlignConfig, seed: int
+    data: TouchData,
+    fold: Fold,
+    sensor: str,
+    towers: Towers,
+    config: AlignConfig,
+    options: TrainerOptions,
 ) -> TouchEncoder:
-    """Train on the training side of a fold for all epochs; nothing is chosen on the other side."""
+    """Train on the training side of a fold for all epochs; nothing is chosen on the other side.
+
+    Returns the encoder on the CPU.
+    """
     own = data.take(torch.from_numpy(fold.train))
     own = replace(own, describes=data.describes & torch.from_numpy(fold.train_text))
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(options.seed)
         encoder = TouchEncoder(
             TouchEncoderConfig.for_towers(find_vit(config), towers, sensor, config.embedding_dim)
         )
@@ -57,8 +65,8 @@ def train(
         progress=lambda m: f"loss {m['loss']:.3f}",
     )
     with tempfile.TemporaryDirectory() as folder:
-        fit(training, Path(folder) / "training", TrainerOptions(seed=seed), {})
-    return encoder.eval()
+        fit(training, Path(folder) / "training", options, {})
+    return encoder.cpu().eval()
 
 
 @torch.no_grad()
