@@ -18,6 +18,7 @@ from touchgoal.policies.network import NOVEL_SECONDS, ObservationBatch, PolicyNe
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_images import ImageEmbedder
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+from touchgoal.policies.perception.key_pose import KeyPoseAverage
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.perception.state_estimation import StateEstimator
 from touchgoal.runtime.errors import RefusedError, UserError
@@ -102,6 +103,7 @@ class LearnedPolicy:
         self._maps: tuple[Observation, Tensor] | None = None  # the latest embedded camera images
         self._recent: list[Observation] = []
         self._novel_plans = 0  # in a row
+        self._key_pose = KeyPoseAverage(self.config.execution_horizon / self.config.control_hz)
         self._width: float | None = None  # of the gripper, where the next plan begins, m
         self._todo: list[np.ndarray] = []  # actions of the present plan
         self._next: list[np.ndarray] = []  # actions of the plan that comes next
@@ -137,8 +139,12 @@ class LearnedPolicy:
             pictures, maps = self._difference_images(history[-1]), self._feature_maps(history[-1])
             batch = ObservationBatch(touch, state, pictures, maps)
             self._refuse_novel(batch)
-            actions = self._network.plan(batch, self._generator, self._width)[0].numpy()
-            self._width = float(actions[self.config.execution_horizon - 1, -1])
+            rest = self._generator, self._width, self._key_pose
+            actions = self._network.plan(batch, *rest)[0].numpy()
+            width = float(actions[self.config.execution_horizon - 1, -1])
+            if width != self._width:
+                self._key_pose.restart()
+            self._width = width
             return actions
 
     def _refuse_novel(self, batch: ObservationBatch) -> None:

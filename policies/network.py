@@ -267,14 +267,19 @@ class PolicyNetwork(nn.Module):
 
     @torch.inference_mode()
     def plan(
-        self, batch: ObservationBatch, generator: torch.Generator, width: float | None = None
+        self,
+        batch: ObservationBatch,
+        generator: torch.Generator,
+        width: float | None = None,
+        average: kp.KeyPoseAverage | None = None,
     ) -> Float[Tensor, "b h 8"]:
         """Return actions (`features.ACTION`) of the ticks from the latest observation on.
 
         The same generator state (on the CPU) gives the same plan. `width` is the last plan's, m: with
-        cameras a gripper of two widths keeps it until the hand is at the next key pose.
+        cameras a gripper of two widths keeps it until the hand is at the next key pose. `average` is
+        that of the key poses seen in the episode; without it only the latest images count.
         """
-        pose = self._see(batch)
+        pose = self._see(batch, average)
         encoded = self._encode(batch, self._encode_touch(batch), pose)
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)
@@ -284,12 +289,16 @@ class PolicyNetwork(nn.Module):
                 actions[..., -1] = actions[..., -1].where(kp.reached(pose)[:, None], width)
         return actions
 
-    def _see(self, batch: ObservationBatch) -> Float[Tensor, "b 9"] | None:
+    def _see(
+        self, batch: ObservationBatch, average: kp.KeyPoseAverage | None
+    ) -> Float[Tensor, "b 9"] | None:
         """Return the next key pose in the hand's frame, as the cameras show it."""
         if not self.key_pose:
             return None
         assert batch.maps is not None, "needs the cameras' feature maps"
-        return self.key_pose(batch.maps.float(), *self._hand(batch.state[:, -1]))
+        tcp, width = self._hand(batch.state[:, -1])
+        pose, weight = self.key_pose(batch.maps.float(), tcp, width)
+        return average.add(pose, weight, tcp) if average else pose
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None

@@ -12,6 +12,7 @@ from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.frozen_images import ImageInputConfig
 from touchgoal.policies.perception.key_pose import (
+    KeyPoseAverage,
     KeyPoseReadout,
     _columns,
     _in_hand_frame,
@@ -88,6 +89,25 @@ def test_poses_turn_into_the_hands_frame_as_scipy_turns_them() -> None:
     turned = (R.inv() * Rotation.from_quat(key[:, 3:].numpy(), scalar_first=True)).as_matrix()
     np.testing.assert_allclose(found[:, 3:6], turned[:, :, 0], atol=1e-5)
     np.testing.assert_allclose(found[:, 6:], turned[:, :, 1], atol=1e-5)
+
+
+def test_the_average_of_a_moving_hand_steadies_and_follows_the_gripper() -> None:
+    rng, average = np.random.default_rng(3), KeyPoseAverage(0.3)
+    tcp, keys = _poses(rng, 60), _poses(rng, 2)
+    off = []
+    for tick, hand in enumerate(tcp[:, None]):
+        if tick == 30:
+            average.restart()
+        true = _in_hand_frame(hand, _columns(keys[[tick // 30]]))
+        hidden = tick % 3 == 2  # and the estimate says so
+        noise = torch.from_numpy(rng.normal(0, 0.1 if hidden else 0.01, (1, 9))).float()
+        weight = torch.full((1, 2), 1.0 if hidden else 100.0)
+        found = average.add(true + noise, weight, hand)
+        off.append(((found - true)[0, :3].norm() / noise[0, :3].norm()).item())
+    assert off[0] == pytest.approx(1, abs=1e-3)
+    assert off[30:32] == pytest.approx([1, 1], abs=1e-3)  # nothing is left of the first key pose
+    assert np.median(off[40:]) < 0.6
+    assert np.median(off[11:30:3] + off[41::3]) < 0.2  # where it is hidden
 
 
 def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:

@@ -4,6 +4,7 @@ The recordings hold it (keyframes: James and Davison 2022), and camera images sh
 policy learns where things are; trained on the actions alone, it memorises the recordings.
 """
 
+import math
 from collections.abc import Sequence
 from typing import cast
 
@@ -30,6 +31,7 @@ _LEAST, _MOST = -5.0, 3.0  # logarithm of a camera's expected error
 _BESIDE = 0.02, 0.02, 0.01, 0.2  # m along the hand's axes, rad about its z axis
 _BACK = 10  # ticks
 _REACHED = 0.02  # m
+_MEMORY = 1.0  # s after which an estimate weighs 1/e in the average
 
 
 def next_key_poses(
@@ -122,9 +124,13 @@ class KeyPoseReadout(nn.Module):
         maps: Float[Tensor, "b k c y x"],
         tcp: Float[Tensor, "b 7"],
         width: Float[Tensor, "b 1"],
-    ) -> Float[Tensor, "b 9"]:
-        """Return the estimate in the hand's frame: position, m, and two columns of the rotation."""
-        return _fused(*self._estimates(maps, tcp, width))
+    ) -> tuple[Float[Tensor, "b 9"], Float[Tensor, "b 2"]]:
+        """Return the estimate in the hand's frame: position, m, and two columns of the rotation.
+
+        And how much its position and its rotation weigh beside other estimates.
+        """
+        poses, expected = self._estimates(maps, tcp, width)
+        return _fused(poses, expected), (-2 * expected).exp().sum(1)
 
     def loss(
         self,
@@ -133,10 +139,10 @@ class KeyPoseReadout(nn.Module):
         width: Float[Tensor, "b 1"],
         key: Float[Tensor, "b 7"],
     ) -> tuple[Float[Tensor, ""], Float[Tensor, "b 9"]]:
-        """Return the loss of the estimates and of the errors that the cameras expect, and `forward`'s result.
+        """Return the loss of the estimates and of the errors that the cameras expect, and the fused estimate.
 
         The expected errors do not weigh the estimates (Seitzer et al. 2022): hard images are learned, too.
-        No gradient goes through the result.
+        No gradient goes through the estimate.
         """
         poses, expected = self._estimates(maps, tcp, width)
         off = poses - _in_hand_frame(tcp, _columns(key))[:, None]
@@ -154,7 +160,7 @@ class KeyPoseReadout(nn.Module):
         key: Float[Tensor, "b 7"],
     ) -> Float[Tensor, " b"]:
         """Return how far the estimates are off, m."""
-        return (self(maps, tcp, width) - _in_hand_frame(tcp, _columns(key)))[:, :3].norm(dim=1)
+        return (self(maps, tcp, width)[0] - _in_hand_frame(tcp, _columns(key)))[:, :3].norm(dim=1)
 
     def _estimates(
         self,
@@ -178,6 +184,35 @@ class KeyPoseReadout(nn.Module):
         return torch.stack(poses, 1), torch.stack(expected, 1)
 
 
+class KeyPoseAverage:
+    """Average of an episode's latest estimates: over its goal the hand hides it from the cameras.
+
+    Made in the base's frame. While the gripper changes, and `HOLD_SECONDS` after, the latest one stands alone.
+    """
+
+    def __init__(self, plan_seconds: float) -> None:
+        """Begin an episode with an estimate every `plan_seconds`."""
+        self._keep = math.exp(-plan_seconds / _MEMORY)
+        self._hold = math.ceil(HOLD_SECONDS / plan_seconds)
+        self._alone = 0  # estimates still to come that stand alone
+        self._weight, self._mean = torch.zeros(1, 2), torch.zeros(1, _POSE)
+
+    def restart(self) -> None:
+        """Forget what was: the gripper changes, and the next key pose is another."""
+        self._alone = self._hold
+
+    def add(
+        self, pose: Float[Tensor, "1 9"], weight: Float[Tensor, "1 2"], tcp: Float[Tensor, "1 7"]
+    ) -> Float[Tensor, "1 9"]:
+        """Add an estimate in the hand's frame with its weight; return the average, in that frame."""
+        before = self._weight * self._keep * (self._alone == 0)
+        self._alone = max(self._alone - 1, 0)
+        self._weight = before + weight
+        share = (weight / self._weight).repeat_interleave(torch.tensor([3, 6]), 1)
+        self._mean = torch.lerp(self._mean, _in_base_frame(tcp, pose), share)
+        return _in_hand_frame(tcp, self._mean)
+
+
 def _fused(poses: Float[Tensor, "b k 9"], expected: Float[Tensor, "b k 2"]) -> Float[Tensor, "b 9"]:
     weights = (-2 * expected).softmax(1)  # inverse squares of the expected errors
     return (weights.repeat_interleave(torch.tensor([3, 6]).to(poses.device), 2) * poses).sum(1)
@@ -187,9 +222,19 @@ def _columns(pose: Float[Tensor, "b 7"]) -> Float[Tensor, "b 9"]:
     return torch.cat([pose[:, :3], rotation_6d(pose[:, 3:])], 1)
 
 
+def _axes(tcp: Float[Tensor, "b 7"]) -> Float[Tensor, "b 3 3"]:
+    """Return the hand's axes in the base's frame, as rows."""
+    x, y = rotation_6d(tcp[:, 3:]).split(3, 1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], 1)
+
+
 def _in_hand_frame(tcp: Float[Tensor, "b 7"], pose: Float[Tensor, "b 9"]) -> Float[Tensor, "b 9"]:
     """Return a pose of the base frame (position, two columns of the rotation) in the hand's."""
-    x, y = rotation_6d(tcp[:, 3:]).split(3, 1)
-    axes = torch.stack([x, y, torch.linalg.cross(x, y)], 1)  # the hand's, as rows
     rows = pose - torch.cat([tcp[:, :3], torch.zeros_like(pose[:, 3:])], 1)
-    return (rows.unflatten(1, (3, 3)) @ axes.mT).flatten(1)
+    return (rows.unflatten(1, (3, 3)) @ _axes(tcp).mT).flatten(1)
+
+
+def _in_base_frame(tcp: Float[Tensor, "b 7"], pose: Float[Tensor, "b 9"]) -> Float[Tensor, "b 9"]:
+    """Return a pose of the hand's frame in the base's."""
+    turned = (pose.unflatten(1, (3, 3)) @ _axes(tcp)).flatten(1)
+    return turned + torch.cat([tcp[:, :3], torch.zeros_like(pose[:, 3:])], 1)
