@@ -22,6 +22,7 @@ from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
     read_objectfolder_real,
     read_touches,
 )
+from touchgoal.episodes.importers.touch_sets.tvl import read_tvl
 from touchgoal.episodes.importers.touch_sets.vt60 import (
     inside_dome,
     is_vt60,
@@ -232,3 +233,49 @@ def test_objectfolder_real(tmp_path: Path) -> None:
     assert untouched[0, 0, 0] == 100
     result = zero_shot.run(zero_shot.Config(data=tmp_path))
     assert "the most frequent material" in result["table"] and "0.67" in result["table"]
+
+
+def test_tvl(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng, ssvtp, hct = np.random.default_rng(0), tmp_path / "ssvtp", tmp_path / "hct" / "data1"
+    felt, rows, header = (
+        ("smooth, hard", "rough, soft"),
+        [],
+        ("url", "tactile", "background", "caption"),
+    )
+    for i in range(24):
+        touched = np.full((24, 32, 3), 120.0) + rng.normal(0, 5, (24, 32, 3))
+        touched[:, : 16 if i % 2 else 4] += 60
+        if i < 8:
+            write_picture(ssvtp / f"images_rgb/image_{i}_rgb.jpg", touched)
+            write_picture(ssvtp / f"images_tac/image_{i}_tac.jpg", touched)
+            (ssvtp / "text").mkdir(exist_ok=True)
+            (ssvtp / "text" / f"labels_{i}.txt").write_text(felt[i % 2].capitalize() + ".\n")
+            continue
+        own = (f"vision/{i // 2}/{i}.jpg", f"tactile/{i // 2}/{i}.jpg", f"tactile/{i // 2}/bg.jpg")
+        rows.append((*own, felt[i % 2]))
+        for name in own[:2]:
+            write_picture(hct / name, touched)
+    urls = [(f"images_rgb/image_{i}_rgb.jpg",) for i in range(8)]
+    write_table(ssvtp / "train.csv", ("url",), *urls[:6])
+    write_table(ssvtp / "test.csv", ("url",), *urls[6:])
+    write_table(hct / "train.csv", header, *rows)
+    (hct / "contact.json").write_text(json.dumps({}))
+    write_picture(hct / "digit_background.png", np.full((24, 32, 3), 120.0))
+    touches = read_tvl(tmp_path)
+    assert len(touches) == 24 and touches[0].words == ("smooth", "hard")
+    assert touches[0].untouched is None and touches[0].press == "ssvtp/0"
+    assert touches[6].press == "hct/data1/tactile/4"  # a frame before another of the same press
+    assert touches[6].untouched == hct / "digit_background.png"  # where a press has none of its own
+    command = (
+        f"benchmark retrieval --data {tmp_path} --cache {tmp_path / 'cache'} --encoders pixels"
+    )
+    command += f" --seeds 1 --heads.epochs 20 --out {tmp_path / 'run'}"
+    assert main(command.split()) in (0, None)
+    assert "of 2 objects" in capsys.readouterr().out
+    judged = json.loads((tmp_path / "run/metrics.json").read_text())["rows"]
+    found = {r["row"]: r for r in judged if r["split"] == "press"}
+    assert found["raw pixels"]["touch to text"][0] == 100 > found["chance"]["touch to text"][0]
+    assert found["pixels"]["image to text"][0] == 100
+    (hct / rows[0][0]).unlink()
+    with pytest.raises(UserError, match="not there"):
+        read_tvl(tmp_path)

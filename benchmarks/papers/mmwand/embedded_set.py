@@ -3,13 +3,15 @@
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from touchgoal.benchmarks.real_touch.embedders import find_embedder
+from touchgoal.benchmarks.real_touch.embedders import Embedder, find_embedder
+from touchgoal.control.arrays import Picture
 from touchgoal.encoders.alignment.config import Split
 from touchgoal.encoders.alignment.splits import Fold, split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet
@@ -51,7 +53,8 @@ def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> 
         cache: folder that keeps the embeddings.
     """
     data, towers = WandSet.open(root), load_towers("offline")
-    made = {name: _embed_touches(name, seed, data, cache) for name in encoders}
+    keep = partial(cached, cache, data.episodes.checksum)
+    made = {name: _embed_touches(name, seed, data, keep) for name in encoders}
     return EmbeddedSet(
         names=data.names,
         sensor=find_sensor_name(None, data.episodes),
@@ -60,23 +63,28 @@ def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> 
         sentences=data.sentences,
         describes=data.describes,
         texts=towers.embed_texts(list(data.sentences)).numpy(),
-        image=_cached(cache, data, f"wand view {towers.name}", lambda: data.embed_views(towers)),
+        image=keep(f"wand view {towers.name}", lambda: data.embed_views(towers)),
         touch=made,
-        pixels=_cached(cache, data, f"pixels {_SMALL}", lambda: _pixels(data)),
+        pixels=keep(f"pixels {_SMALL}", lambda: _pixels(data)),
     )
 
 
-def _embed_touches(name: str, seed: int, data: WandSet, cache: Path) -> Float32[np.ndarray, "n d"]:
-    """Embed all touches. The first one's embedding names the cache: an encoder's name may get new weights."""
+def _embed_touches(
+    name: str, seed: int, data: WandSet, keep: Callable[[str, Callable[[], np.ndarray]], np.ndarray]
+) -> Float32[np.ndarray, "n d"]:
     embed = find_embedder(name, seed)
-    untouched, touched = data.pictures(0)
-    first = hashlib.sha256(embed(touched[None], untouched).tobytes()).hexdigest()
-    return _cached(cache, data, f"touch {first}", lambda: data.embed_touches(embed))
+    what = touch_key(embed, *data.pictures(0))
+    return keep(what, lambda: data.embed_touches(embed))
 
 
-def _cached(cache: Path, data: WandSet, what: str, make: Callable[[], np.ndarray]) -> np.ndarray:
-    """Return an array from the cache, or make and keep it."""
-    key = hashlib.sha256(f"{what} {data.episodes.checksum}".encode()).hexdigest()[:16]
+def touch_key(embed: Embedder, untouched: Picture, touched: Picture) -> str:
+    """Return a key of touch embeddings, of the first one's: an encoder's name may get new weights."""
+    return f"touch {hashlib.sha256(embed(touched[None], untouched).tobytes()).hexdigest()}"
+
+
+def cached(cache: Path, data: str, what: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """Return an array from the cache, or make and keep it; `data` is the checksum of a set."""
+    key = hashlib.sha256(f"{what} {data}".encode()).hexdigest()[:16]
     path = cache / f"{key}.npy"
     if path.exists():
         return np.load(path)
@@ -86,10 +94,12 @@ def _cached(cache: Path, data: WandSet, what: str, make: Callable[[], np.ndarray
     return array
 
 
+def small_change(untouched: Picture, touched: Picture) -> Float32[np.ndarray, " p"]:
+    """Return the raw pixels of a touch: its change, 40 x 30 px with its sign."""
+    change = touched.astype(np.float32) - untouched
+    return cv2.resize(change, _SMALL, interpolation=cv2.INTER_AREA).ravel()
+
+
 def _pixels(data: WandSet) -> Float32[np.ndarray, "n d"]:
-    rows = []
-    for i in track(range(len(data)), "reading pixels", "touch"):
-        untouched, touched = data.pictures(i)
-        change = touched.astype(np.float32) - untouched
-        rows.append(cv2.resize(change, _SMALL, interpolation=cv2.INTER_AREA).ravel())
-    return np.stack(rows)
+    reading = track(range(len(data)), "reading pixels", "touch")
+    return np.stack([small_change(*data.pictures(i)) for i in reading])

@@ -21,6 +21,7 @@ from jaxtyping import Float, Int
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
 from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
+from touchgoal.benchmarks.papers.mmwand.real.captioned_set import embed_captioned
 from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_retrieval
 from touchgoal.benchmarks.papers.mmwand.trained import (
     Trainable,
@@ -37,8 +38,10 @@ from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
+from touchgoal.episodes.importers.touch_sets.tvl import is_tvl
 from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.rewards.report.text_table import aligned
+from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
 
@@ -58,8 +61,9 @@ class Config(BenchmarkOptions):
     """Options of benchmark retrieval."""
 
     data: Path = field(kw_only=True)
-    """Touches recorded by `collect-touches --body wand`, or vt60's folder (real touches of a dome; it
-    uses its own networks and, of the options below, only `cache` and `seed`)."""
+    """Touches recorded by `collect-touches --body wand`; TVL's folder, with ssvtp/ or hct/ (real touches
+    of a DIGIT; its captions stand for objects); or vt60's folder (real touches of a dome; it uses its own
+    networks and, of the options below, only `cache` and `seed`)."""
     encoders: tuple[str, ...] = ("gelsight_mini", "random:gelsight_mini")
     """Touch encoders: see benchmark real-touch."""
     splits: tuple[Split, ...] = SPLITS
@@ -89,7 +93,14 @@ def run(config: Config) -> dict[str, Any]:
     """Fit heads and judge retrieval, split by split."""
     if is_vt60(config.data):
         return run_retrieval(config.data, config.seed, config.cache)
-    data = embed_set(config.data, config.encoders, config.seed, config.cache)
+    splits: tuple[Split, ...] = config.splits
+    if is_tvl(config.data):
+        if config.trained:
+            raise UserError("--trained needs touches of the wand: leave it out for TVL")
+        data = embed_captioned(config.data, config.encoders, config.seed, config.cache)
+        splits = tuple(split for split in splits if split != "sentence")  # each object has one
+    else:
+        data = embed_set(config.data, config.encoders, config.seed, config.cache)
     without = replace(config.heads, text_weight=0.0)
     judged = {"raw pixels": _nearest_in_pixels, "chance": _chance}
     for name in config.encoders:
@@ -97,7 +108,7 @@ def run(config: Config) -> dict[str, Any]:
         judged[f"{name}, without touch-text"] = partial(_with_heads, name=name, config=without)
     once = _judges_that_train(config)
     rows, pools = [], {}
-    work = list(product(config.splits, judged | once))
+    work = list(product(splits, judged | once))
     for split, what in track(work, "retrieval", "row"):
         seeds = range(1 if what in once else config.seeds)
         folds = [data.fold(split, seed) for seed in seeds]
@@ -138,7 +149,9 @@ def _judges_that_train(config: Config) -> dict[str, Callable[[EmbeddedSet, Fold,
     for backbone, weight in product(config.trained, (1.0, 0.0)):
         align = AlignConfig(backbone=backbone, epochs=config.epochs, text_weight=weight)
         without = "" if weight else ", without touch-text"
-        rows[f"{backbone} trained{without}"] = partial(_trained, touches, towers, align, config.device)
+        rows[f"{backbone} trained{without}"] = partial(
+            _trained, touches, towers, align, config.device
+        )
     return rows
 
 
