@@ -24,6 +24,7 @@ _BANDS = 8  # bands of a picture, checked for frozen parts
 _STRIDE = 4  # pixels between those compared
 _LEARNING = 20  # number of first pictures, which show the bands that sensor noise changes
 _LIVELY = 0.8  # share of these pictures in which a band must change to be watched
+_Spotted = tuple[Picture, Bool[np.ndarray, "h w"] | None]  # a picture, and where its dots are
 # av 15, which lerobot 0.6 pins, has no argument `threads`.
 _THREADS = {"threads": 1} if int(av.__version__.split(".")[0]) > 15 else {}
 
@@ -52,26 +53,33 @@ class BrokenBlocks:
     """Finds pictures of a gel from a damaged JPEG, by their change from the last good picture.
 
     A decoder cannot detect every wrong byte. A byte that it misses changes the brightness of whole
-    JPEG blocks; real changes of a smooth gel do not stop at block borders. Moving dots look like such
-    blocks, so pixels near dots do not count; `dots` is their diameter as a share of the picture's
-    diagonal, 0 without dots.
+    JPEG blocks; real changes of a smooth gel do not stop at block borders, but for a straight edge that
+    lies on one. It stays, and no two damages are alike: a picture that goes on from the one just refused
+    is intact. Moving dots look like such blocks, so pixels near dots do not count; `dots` is their
+    diameter as a share of the picture's diagonal, 0 without dots.
     """
 
     def __init__(self, dots: float) -> None:
         self._dots = dots
-        self._before: tuple[Picture, Bool[np.ndarray, "h w"] | None] | None = None
+        self._intact: _Spotted | None = None
+        self._refused: _Spotted | None = None  # the picture before, if that was refused
 
     def update(self, image: Picture) -> bool:
-        """Return whether a picture is broken; the next is compared with the last intact one."""
-        spots = _dark_spots(image, self._dots) if self._dots > 0 else None
-        if self._before is not None:
-            before, dark = self._before
-            change = cv2.subtract(image, before, dtype=cv2.CV_16S)
-            clear = None if spots is None or dark is None else ~(spots | dark)
-            if _jumps_at_blocks(cv2.transform(change, _ALL_CHANNELS), clear) > _SMOOTH:
-                return True
-        self._before = image, spots
+        """Return whether a picture is broken."""
+        new = image, _dark_spots(image, self._dots) if self._dots > 0 else None
+        before = [old for old in (self._intact, self._refused) if old is not None]
+        if before and all(_change_at_blocks(new, old) > _SMOOTH for old in before):
+            self._refused = new
+            return True
+        self._intact, self._refused = new, None
         return False
+
+
+def _change_at_blocks(new: _Spotted, old: _Spotted) -> float:
+    """Return by how much the change between two pictures jumps at block borders, counts."""
+    change = cv2.subtract(new[0], old[0], dtype=cv2.CV_16S)
+    clear = None if new[1] is None or old[1] is None else ~(new[1] | old[1])
+    return _jumps_at_blocks(cv2.transform(change, _ALL_CHANNELS), clear)
 
 
 def _jumps_at_blocks(
