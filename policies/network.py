@@ -183,7 +183,7 @@ class PolicyNetwork(nn.Module):
         wrench: Float[Tensor, "n 12"] | None = None,
         action_is_pad: Bool[Tensor, "m h"] | None = None,
         maps: Float16[Tensor, "n k c y x"] | None = None,
-        key_pose: Float[Tensor, "n 7"] | None = None,
+        key_pose: Float[Tensor, "n 8"] | None = None,
     ) -> None:
         """Fit the normalizers to training data: n ticks, and the chunks of m windows.
 
@@ -220,7 +220,7 @@ class PolicyNetwork(nn.Module):
         noise: BatchNoise,
         wrench: Float[Tensor, "b o 12"] | None = None,
         action_is_pad: Bool[Tensor, "b h"] | None = None,
-        key_pose: Float[Tensor, "b 7"] | None = None,
+        key_pose: Float[Tensor, "b 8"] | None = None,
     ) -> Float[Tensor, ""]:
         """Return the training loss on windows, without ticks after the episode's end.
 
@@ -251,7 +251,7 @@ class PolicyNetwork(nn.Module):
 
     @torch.no_grad()
     def key_pose_error(
-        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 7"]
+        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 8"]
     ) -> Float[Tensor, " b"]:
         """Return how far off sight sees the next key pose, m."""
         assert self.key_pose and batch.maps is not None, "needs cameras"
@@ -291,7 +291,7 @@ class PolicyNetwork(nn.Module):
 
     def _see(
         self, batch: ObservationBatch, average: kp.KeyPoseAverage | None
-    ) -> Float[Tensor, "b 9"] | None:
+    ) -> Float[Tensor, "b 10"] | None:
         """Return the next key pose in the hand's frame, as the cameras show it."""
         if not self.key_pose:
             return None
@@ -316,7 +316,7 @@ class PolicyNetwork(nn.Module):
         self,
         batch: ObservationBatch,
         touch: Float[Tensor, "b o w"],
-        pose: Float[Tensor, "b 9"] | None,
+        pose: Float[Tensor, "b 10"] | None,
         noise: BatchNoise | None = None,
     ) -> Float[Tensor, "b c"]:
         """Return the head's whole input, with the training's noise if given."""

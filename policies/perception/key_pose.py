@@ -1,6 +1,7 @@
 """The next key pose: where the hand will be when the gripper next opens or closes, or the task ends.
 
-The recordings hold it (keyframes: James and Davison 2022), and camera images show it. Taught it, a
+With it comes whether the gripper is closed afterwards: without that, the end of a task looks like the
+place to grasp. The recordings hold both (keyframes: James and Davison 2022), and camera images show it. Taught it, a
 policy learns where things are; trained on the actions alone, it memorises the recordings.
 """
 
@@ -10,6 +11,7 @@ from typing import cast
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float16, Float32
 from torch import Tensor, nn
 
@@ -19,8 +21,10 @@ from touchgoal.policies.heads.mlp import readout
 from touchgoal.policies.perception.frozen_images import ImageInputConfig, ImageReadout
 from touchgoal.policies.perception.proprioception import rotation_6d
 
-KEY_POSE_DIM = 12  # of `features`
-_POSE = 9  # position, and two columns of the rotation matrix
+KEY_POSE_DIM = 13  # of `features`
+_POSE = (
+    9  # position, and two columns of the rotation matrix; then whether the gripper is closed after
+)
 HOLD_SECONDS = 0.5  # s in which the fingers move
 _LEVELS = 1e-3  # m between the least and the greatest commanded width: less is one width
 _POSITION, _ROTATION = 0.05, 0.3  # m and rad that weigh alike
@@ -39,37 +43,39 @@ def next_key_poses(
     widths: Float32[np.ndarray, " n"],
     lengths: Sequence[int],
     hold: int,
-) -> Float32[np.ndarray, "n 7"]:
+) -> Float32[np.ndarray, "n 8"]:
     """Return for every tick the TCP pose at the next change of the commanded width, or at the end.
 
-    `lengths` are the ticks of each episode, one after the other. It stays for `hold` ticks after the
+    And 1 if the gripper is closed after it, else 0. `lengths` are the ticks of each episode, one after the other. It stays for `hold` ticks after the
     change: until the fingers have moved, nothing shows that it was commanded.
     """
     closed = widths < (widths.min() + widths.max()) / 2
     changes = np.flatnonzero(np.diff(closed)) if np.ptp(widths) > _LEVELS else []
     ends = np.cumsum(lengths) - 1
     keys = np.union1d(changes, ends).astype(np.int64)
-    until = np.minimum(keys + hold, ends[np.searchsorted(ends, keys)])
-    return tcp[keys[np.searchsorted(until, np.arange(len(tcp)))]]
+    last = ends[np.searchsorted(ends, keys)]
+    after = closed[np.minimum(keys + 1, last)].astype(np.float32)[:, None]
+    key = np.searchsorted(np.minimum(keys + hold, last), np.arange(len(tcp)))
+    return np.concatenate([tcp[keys], after], 1)[key]
 
 
-def features(pose: Float[Tensor, "b 9"], noise: BatchNoise | None = None) -> Float[Tensor, "b 12"]:
+def features(pose: Float[Tensor, "b 10"], noise: BatchNoise | None = None) -> Float[Tensor, "b 13"]:
     """Return a policy's input for the key poses in the hand's frame, with the training's noise if given."""
     if noise is not None:
-        scale = torch.tensor([_NOISE] * 3 + [_NOISE / _POSITION * _ROTATION] * 6)
+        scale = torch.tensor([_NOISE] * 3 + [_NOISE / _POSITION * _ROTATION] * 6 + [0])
         pose = pose + noise.randn(pose.shape).to(pose) * scale.to(pose)
     away = pose[:, :3]
     return torch.cat([away / _POSITION, away / (away.abs() + _NEAR), pose[:, 3:]], 1)
 
 
-def reached(pose: Float[Tensor, "b 9"]) -> Bool[Tensor, " b"]:
+def reached(pose: Float[Tensor, "b 10"]) -> Bool[Tensor, " b"]:
     """Return whether the hand is at key poses in its frame, as well as sight can tell."""
     return pose[:, :3].norm(dim=1) < _REACHED
 
 
 def set_beside(
-    pose: Float[Tensor, "b 9"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
-) -> tuple[Float[Tensor, "b 9"], Float[Tensor, "b h 8"]]:
+    pose: Float[Tensor, "b 10"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
+) -> tuple[Float[Tensor, "b 10"], Float[Tensor, "b h 8"]]:
     """Return half of the key poses and plans ("body_twist") as from a hand beside the recorded one.
 
     The plans lead it back: recordings hardly show how errors are corrected. Where the gripper changes
@@ -83,19 +89,21 @@ def set_beside(
     cos, sin, zero = turn.cos(), turn.sin(), torch.zeros_like(turn)
     rows = torch.cat([cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1], 1)
     axes = rows.unflatten(1, (3, 3))  # R^T: row vectors times it are turned by `turn` about z
-    there = torch.cat([pose[:, :3] + shift, pose[:, 3:]], 1).unflatten(1, (3, 3)) @ axes
+    there = torch.cat([pose[:, :3] + shift, pose[:, 3:_POSE]], 1).unflatten(1, (3, 3)) @ axes
     back = (torch.arange(1, chunk.shape[1] + 1).to(chunk) / _BACK).clamp(max=1)[:, None]
     position = (chunk[..., :3] + back * shift[:, None]) @ axes
     rotation = chunk[..., 3:6] @ axes
     rotation = torch.cat([rotation[..., :2], rotation[..., 2:] + back * turn[:, None]], 2)
-    return there.flatten(1), torch.cat([position, rotation, chunk[..., 6:]], 2)
+    there = torch.cat([there.flatten(1), pose[:, _POSE:]], 1)
+    return there, torch.cat([position, rotation, chunk[..., 6:]], 2)
 
 
 class KeyPoseReadout(nn.Module):
     """Network from the cameras' feature maps to the next key pose relative to the hand.
 
     Each camera gives an estimate and the error that it expects: one on the hand in the hand's frame,
-    another in the base's. The estimates are averaged, the surer ones with more weight.
+    another in the base's; and whether the gripper is closed after it. The estimates are averaged, the
+    surer ones with more weight.
     """
 
     def __init__(self, config: ImageInputConfig) -> None:
@@ -104,14 +112,14 @@ class KeyPoseReadout(nn.Module):
         self.images = nn.ModuleList(ImageReadout(config) for _ in config.cameras)
         self.state_normalizer, self.place_normalizer = Normalizer((2,)), Normalizer((3,))
         width = ImageReadout.width(config) + 2
-        self.heads = nn.ModuleList(readout(width, 128, _POSE + 2) for _ in config.cameras)
+        self.heads = nn.ModuleList(readout(width, 128, _POSE + 3) for _ in config.cameras)
 
     def fit(
         self,
         maps: Float16[Tensor, "n k c y x"],
         tcp: Float[Tensor, "n 7"],
         width: Float[Tensor, "n 1"],
-        key: Float[Tensor, "n 7"],
+        key: Float[Tensor, "n 8"],
     ) -> None:
         """Fit the normalizers to training data."""
         for camera, images in enumerate(self.images):
@@ -124,56 +132,63 @@ class KeyPoseReadout(nn.Module):
         maps: Float[Tensor, "b k c y x"],
         tcp: Float[Tensor, "b 7"],
         width: Float[Tensor, "b 1"],
-    ) -> tuple[Float[Tensor, "b 9"], Float[Tensor, "b 2"]]:
+    ) -> tuple[Float[Tensor, "b 10"], Float[Tensor, "b 2"]]:
         """Return the estimate in the hand's frame: position, m, and two columns of the rotation.
 
-        And how much its position and its rotation weigh beside other estimates.
+        Then the probability that the gripper is closed after it; and how much its position and the rest
+        weigh beside other estimates.
         """
-        poses, expected = self._estimates(maps, tcp, width)
-        return _fused(poses, expected), (-2 * expected).exp().sum(1)
+        poses, expected, closed = self._estimates(maps, tcp, width)
+        return _fused(poses, expected, closed), (-2 * expected).exp().sum(1)
 
     def loss(
         self,
         maps: Float[Tensor, "b k c y x"],
         tcp: Float[Tensor, "b 7"],
         width: Float[Tensor, "b 1"],
-        key: Float[Tensor, "b 7"],
-    ) -> tuple[Float[Tensor, ""], Float[Tensor, "b 9"]]:
+        key: Float[Tensor, "b 8"],
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, "b 10"]]:
         """Return the loss of the estimates and of the errors that the cameras expect, and the fused estimate.
 
         The expected errors do not weigh the estimates (Seitzer et al. 2022): hard images are learned, too.
         No gradient goes through the estimate.
         """
-        poses, expected = self._estimates(maps, tcp, width)
-        off = poses - _in_hand_frame(tcp, _columns(key))[:, None]
+        poses, expected, closed = self._estimates(maps, tcp, width)
+        off = poses - _in_hand_frame(tcp, _columns(key[:, :7]))[:, None]
         off = off[..., :3].norm(dim=-1) / _POSITION, off[..., 3:].norm(dim=-1) / _ROTATION
         errors = torch.stack(off, -1)
         errors = torch.where(errors < _SMALL, errors.square() / 2 / _SMALL, errors - _SMALL / 2)
         sureness = errors.detach() * (-expected).exp() + expected
-        return errors.mean() + 0.1 * sureness.mean(), _fused(poses, expected).detach()
+        after = F.binary_cross_entropy_with_logits(closed, key[:, 7:].expand_as(closed))
+        loss = errors.mean() + 0.1 * sureness.mean() + 0.1 * after
+        return loss, _fused(poses, expected, closed).detach()
 
     def error(
         self,
         maps: Float[Tensor, "b k c y x"],
         tcp: Float[Tensor, "b 7"],
         width: Float[Tensor, "b 1"],
-        key: Float[Tensor, "b 7"],
+        key: Float[Tensor, "b 8"],
     ) -> Float[Tensor, " b"]:
         """Return how far the estimates are off, m."""
-        return (self(maps, tcp, width)[0] - _in_hand_frame(tcp, _columns(key)))[:, :3].norm(dim=1)
+        off = self(maps, tcp, width)[0][:, :_POSE] - _in_hand_frame(tcp, _columns(key[:, :7]))
+        return off[:, :3].norm(dim=1)
 
     def _estimates(
         self,
         maps: Float[Tensor, "b k c y x"],
         tcp: Float[Tensor, "b 7"],
         width: Float[Tensor, "b 1"],
-    ) -> tuple[Float[Tensor, "b k 9"], Float[Tensor, "b k 2"]]:
-        """Return each camera's pose in the hand's frame, and the logarithm of its expected errors."""
+    ) -> tuple[Float[Tensor, "b k 9"], Float[Tensor, "b k 2"], Float[Tensor, "b k"]]:
+        """Return each camera's pose in the hand's frame, and the logarithm of its expected errors.
+
+        And the logit of the gripper's being closed after it.
+        """
         state = self.state_normalizer(torch.cat([tcp[:, 2:3], width], 1))
-        poses, expected = [], []
+        poses, expected, closed = [], [], []
         for camera, (images, head) in enumerate(zip(self.images, self.heads, strict=True)):
             found = head(torch.cat([images(maps[:, camera]), state], 1))
-            pose, error = found.split([_POSE, 2], 1)
+            pose, error, after = found.split([_POSE, 2, 1], 1)
             if self.on_hand[camera]:
                 pose = torch.cat([pose[:, :3] * _POSITION, pose[:, 3:]], 1)
             else:
@@ -181,7 +196,8 @@ class KeyPoseReadout(nn.Module):
                 pose = _in_hand_frame(tcp, torch.cat([place, pose[:, 3:]], 1))
             poses.append(pose)
             expected.append(error.clamp(_LEAST, _MOST))
-        return torch.stack(poses, 1), torch.stack(expected, 1)
+            closed.append(after)
+        return torch.stack(poses, 1), torch.stack(expected, 1), torch.cat(closed, 1)
 
 
 class KeyPoseAverage:
@@ -195,27 +211,30 @@ class KeyPoseAverage:
         self._keep = math.exp(-plan_seconds / _MEMORY)
         self._hold = math.ceil(HOLD_SECONDS / plan_seconds)
         self._alone = 0  # estimates still to come that stand alone
-        self._weight, self._mean = torch.zeros(1, 2), torch.zeros(1, _POSE)
+        self._weight, self._mean = torch.zeros(1, 2), torch.zeros(1, _POSE + 1)
 
     def restart(self) -> None:
         """Forget what was: the gripper changes, and the next key pose is another."""
         self._alone = self._hold
 
     def add(
-        self, pose: Float[Tensor, "1 9"], weight: Float[Tensor, "1 2"], tcp: Float[Tensor, "1 7"]
-    ) -> Float[Tensor, "1 9"]:
+        self, pose: Float[Tensor, "1 10"], weight: Float[Tensor, "1 2"], tcp: Float[Tensor, "1 7"]
+    ) -> Float[Tensor, "1 10"]:
         """Add an estimate in the hand's frame with its weight; return the average, in that frame."""
         before = self._weight * self._keep * (self._alone == 0)
         self._alone = max(self._alone - 1, 0)
         self._weight = before + weight
-        share = (weight / self._weight).repeat_interleave(torch.tensor([3, 6]), 1)
+        share = (weight / self._weight).repeat_interleave(torch.tensor([3, 7]), 1)
         self._mean = torch.lerp(self._mean, _in_base_frame(tcp, pose), share)
         return _in_hand_frame(tcp, self._mean)
 
 
-def _fused(poses: Float[Tensor, "b k 9"], expected: Float[Tensor, "b k 2"]) -> Float[Tensor, "b 9"]:
+def _fused(
+    poses: Float[Tensor, "b k 9"], expected: Float[Tensor, "b k 2"], closed: Float[Tensor, "b k"]
+) -> Float[Tensor, "b 10"]:
     weights = (-2 * expected).softmax(1)  # inverse squares of the expected errors
-    return (weights.repeat_interleave(torch.tensor([3, 6]).to(poses.device), 2) * poses).sum(1)
+    pose = (weights.repeat_interleave(torch.tensor([3, 6]).to(poses.device), 2) * poses).sum(1)
+    return torch.cat([pose, closed.mean(1, keepdim=True).sigmoid()], 1)
 
 
 def _columns(pose: Float[Tensor, "b 7"]) -> Float[Tensor, "b 9"]:
@@ -228,13 +247,16 @@ def _axes(tcp: Float[Tensor, "b 7"]) -> Float[Tensor, "b 3 3"]:
     return torch.stack([x, y, torch.linalg.cross(x, y)], 1)
 
 
-def _in_hand_frame(tcp: Float[Tensor, "b 7"], pose: Float[Tensor, "b 9"]) -> Float[Tensor, "b 9"]:
-    """Return a pose of the base frame (position, two columns of the rotation) in the hand's."""
-    rows = pose - torch.cat([tcp[:, :3], torch.zeros_like(pose[:, 3:])], 1)
-    return (rows.unflatten(1, (3, 3)) @ _axes(tcp).mT).flatten(1)
+def _in_hand_frame(tcp: Float[Tensor, "b 7"], pose: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
+    """Return a pose of the base frame (position, two columns of the rotation) in the hand's.
+
+    What follows the pose stays.
+    """
+    rows = pose[:, :_POSE] - F.pad(tcp[:, :3], (0, 6))
+    return torch.cat([(rows.unflatten(1, (3, 3)) @ _axes(tcp).mT).flatten(1), pose[:, _POSE:]], 1)
 
 
-def _in_base_frame(tcp: Float[Tensor, "b 7"], pose: Float[Tensor, "b 9"]) -> Float[Tensor, "b 9"]:
-    """Return a pose of the hand's frame in the base's."""
-    turned = (pose.unflatten(1, (3, 3)) @ _axes(tcp)).flatten(1)
-    return turned + torch.cat([tcp[:, :3], torch.zeros_like(pose[:, 3:])], 1)
+def _in_base_frame(tcp: Float[Tensor, "b 7"], pose: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
+    """Return a pose of the hand's frame in the base's; what follows it stays."""
+    rows = (pose[:, :_POSE].unflatten(1, (3, 3)) @ _axes(tcp)).flatten(1)
+    return torch.cat([rows + F.pad(tcp[:, :3], (0, 6)), pose[:, _POSE:]], 1)

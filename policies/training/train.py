@@ -124,7 +124,7 @@ class _PolicyLoss(nn.Module):
         wrench: Float[Tensor, "b o 12"] | None,
         actions: Float[Tensor, "b h 8"],
         action_is_pad: Bool[Tensor, "b h"],
-        key_pose: Float[Tensor, "b 7"] | None,
+        key_pose: Float[Tensor, "b 8"] | None,
         noise: BatchNoise,
     ) -> dict[str, Tensor]:
         batch = ObservationBatch(touch, state, pictures, maps)
