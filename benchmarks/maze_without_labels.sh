@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# The policies that the records bead-maze-encoders, -seeds, -embedding, -wrench and -learned judge: the maze by each
-# encoder's frozen embedding (Sparsh's task T5), by the wrench read out of it, and by touch that is learned with the
-# policy; of half of 130 demonstrations, and three of them of all, with three seeds; then the table by data, touch
-# and head. Some six hours of one core, estimated. Stopped, the same line goes on.
+# The policies that the records bead-maze-encoders, -seeds, -embedding, -wrench, -learned and -single judge: the
+# maze by each encoder's frozen embedding (Sparsh's task T5), by the wrench read out of it, and by touch that is
+# learned with the policy; of half of 130 demonstrations, and three of them of all, with three seeds; then the table
+# by data, touch and head, and one wire alone. Some six hours of one core, estimated. Stopped, the same line goes on.
 set -eu
 
 demos() { # name, options
@@ -89,3 +89,11 @@ for seed in 1 2; do
     policy "maze-1-embedding-flow-$seed" --seed "$seed" ${touches[embedding]} "${sampled[@]}" --sampler.kind flow \
         --sampler.num-inference-steps 4
 done
+
+# One wire, trained and tested on (record bead-maze-single; Sparsh's appendix C.7).
+demos one-wire --env.wires fourier-3 --episodes 50
+demos one-wire-validation --env.wires fourier-3 --episodes 5 --seed 90000
+both=(--data runs/maze/one-wire/episodes --validation runs/maze/one-wire-validation/episodes)
+# shellcheck disable=SC2086
+policy maze-one-wire ${touches[embedding]} "${sampled[@]}" --representation body_twist --touch-noise 0.5 \
+    --sampler.num-train-timesteps 5 --sampler.num-inference-steps 1 --train.epochs 8
