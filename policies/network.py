@@ -276,17 +276,18 @@ class PolicyNetwork(nn.Module):
         """Return actions (`features.ACTION`) of the ticks from the latest observation on.
 
         The same generator state (on the CPU) gives the same plan. `width` is the last plan's, m: with
-        cameras a gripper of two widths keeps it until the hand is at the next key pose. `average` is
-        that of the key poses seen in the episode; without it only the latest images count.
+        cameras the gripper keeps it until the hand is at the next key pose. `average` is that of the
+        key poses seen in the episode; without it only the latest images count.
         """
         pose = self._see(batch, average)
         encoded = self._encode(batch, self._encode_touch(batch), pose)
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)
-        if self.config.gripper_widths:
-            actions[..., -1] = nearest(actions[..., -1], self.config.gripper_widths)
+        if widths := self.config.gripper_widths:
+            actions[..., -1] = nearest(actions[..., -1], widths)
             if pose is not None and width is not None:
-                actions[..., -1] = actions[..., -1].where(kp.reached(pose)[:, None], width)
+                tcp = torch.stack([self._hand(state)[0] for state in batch.state.unbind(1)], 1)
+                actions[..., -1] = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)
         return actions
 
     def _see(

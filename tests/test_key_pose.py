@@ -24,7 +24,7 @@ from touchgoal.policies.perception.key_pose import (
 @pytest.mark.parametrize(
     ("widths", "lengths", "hold", "keys", "closed"),
     [
-        ([0.08, 0.08, 0.0, 0.0, 0.0, 0.08, 0.08], [7], 0, [1, 1, 4, 4, 4, 6, 6], "1100000"),
+        ([0.08, 0.08, 0.0, 0.0, 0.0, 0.08, 0.08], [7], 0, [1, 1, 4, 4, 4, 4, 4], "1100000"),
         ([0.08, 0.0, 0.0, 0.08, 0.0, 0.0], [3, 3], 0, [0, 2, 2, 3, 5, 5], "111111"),
         ([0.08, 0.0, 0.0, 0.0, 0.0, 0.08], [4, 2], 2, [0, 0, 0, 3, 4, 4], "111100"),
         ([0.05, 0.0501, 0.05, 0.0502], [2, 2], 0, [1, 1, 3, 3], "0000"),  # noise on one width
@@ -136,14 +136,14 @@ def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:
     assert (there[:, 9] == 1).all()
 
 
-def test_the_gripper_changes_only_at_a_key_pose_and_no_velocity_is_read() -> None:
+def test_the_gripper_changes_where_the_hand_rests_at_a_key_pose_and_no_velocity_is_read() -> None:
     images = ImageInputConfig((ft.WRIST,), (96, 96))
     torch.manual_seed(0)
     network = PolicyNetwork(
         PolicyConfig(0, "", images=images, gripper_widths=(0.0, 0.08), representation="body_twist")
     ).eval()
     state = torch.randn(4, 2, 22) / 10
-    state[..., 15:] = _poses(np.random.default_rng(0), 8).view(4, 2, 7)
+    state[..., 15:] = _poses(np.random.default_rng(0), 4)[:, None]  # at rest
     batch = ObservationBatch(torch.empty(4, 2, 0), state, maps=torch.randn(4, 1, 40, 12, 12).half())
 
     def widths(width: float | None) -> torch.Tensor:
@@ -154,8 +154,14 @@ def test_the_gripper_changes_only_at_a_key_pose_and_no_velocity_is_read() -> Non
     assert isinstance(last, torch.nn.Linear)
     torch.nn.init.zeros_(last.weight)
     torch.nn.init.zeros_(last.bias)  # at the key pose
-    free = widths(None)
-    assert torch.equal(widths(0.0), free) and torch.equal(widths(0.08), free)
+    for sees_closed, width in ((5.0, 0.0), (-5.0, 0.08)):
+        last.bias.data[-1] = sees_closed
+        assert (widths(0.0) == width).all() and (widths(0.08) == width).all()
+    state[:, 0, 17] += 0.002  # moving on
+    assert (widths(0.0) == 0).all() and (widths(0.08) == 0.08).all()
+    state[:, 0, 17] -= 0.002
+    last.bias.data[2] = 0.3  # 15 mm away: the head decides
+    assert torch.equal(widths(0.0), widths(None)) and torch.equal(widths(0.08), widths(None))
     last.bias.data[2] = 2.0  # 10 cm away
     assert (widths(0.0) == 0).all() and (widths(0.08) == 0.08).all()
     before = network.plan(batch, torch.Generator().manual_seed(0))

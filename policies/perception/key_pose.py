@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Float16, Float32
+from jaxtyping import Float, Float16, Float32
 from torch import Tensor, nn
 
 from touchgoal.encoders.training.batch_noise import BatchNoise
@@ -22,9 +22,7 @@ from touchgoal.policies.perception.frozen_images import ImageInputConfig, ImageR
 from touchgoal.policies.perception.proprioception import rotation_6d
 
 KEY_POSE_DIM = 13  # of `features`
-_POSE = (
-    9  # position, and two columns of the rotation matrix; then whether the gripper is closed after
-)
+_POSE = 9  # position, and two columns of the rotation matrix
 HOLD_SECONDS = 0.5  # s in which the fingers move
 _LEVELS = 1e-3  # m between the least and the greatest commanded width: less is one width
 _POSITION, _ROTATION = 0.05, 0.3  # m and rad that weigh alike
@@ -35,6 +33,8 @@ _LEAST, _MOST = -5.0, 3.0  # logarithm of a camera's expected error
 _BESIDE = 0.02, 0.02, 0.01, 0.2  # m along the hand's axes, rad about its z axis
 _BACK = 10  # ticks
 _REACHED = 0.02  # m
+_AT = math.sqrt(3) * _NOISE  # m; the training's noise: the head cannot tell it from there
+_STILL = 0.0005  # m per tick
 _MEMORY = 1.0  # s after which an estimate weighs 1/e in the average
 
 
@@ -46,16 +46,24 @@ def next_key_poses(
 ) -> Float32[np.ndarray, "n 8"]:
     """Return for every tick the TCP pose at the next change of the commanded width, or at the end.
 
-    And 1 if the gripper is closed after it, else 0. `lengths` are the ticks of each episode, one after the other. It stays for `hold` ticks after the
-    change: until the fingers have moved, nothing shows that it was commanded.
+    And 1 if the gripper is closed after it, else 0. An episode that ends open has let go: then the last
+    change stays, for the hand above what it left looks like the hand above what it will grasp.
+
+    Args:
+        lengths: ticks of each episode, one after the other.
+        hold: ticks for which a key pose stays after the change: until the fingers have moved, nothing
+            shows that it was commanded.
     """
     closed = widths < (widths.min() + widths.max()) / 2
-    changes = np.flatnonzero(np.diff(closed)) if np.ptp(widths) > _LEVELS else []
     ends = np.cumsum(lengths) - 1
-    keys = np.union1d(changes, ends).astype(np.int64)
+    changes = np.flatnonzero(np.diff(closed)) if np.ptp(widths) > _LEVELS else np.empty(0, int)
+    let_go = ~closed[ends] & np.isin(ends, ends[np.searchsorted(ends, changes)])
+    keys = np.union1d(changes, ends[~let_go]).astype(np.int64)
     last = ends[np.searchsorted(ends, keys)]
+    final = np.append(last[1:] != last[:-1], True)
+    until = np.where(final, last, np.minimum(keys + hold, last))
     after = closed[np.minimum(keys + 1, last)].astype(np.float32)[:, None]
-    key = np.searchsorted(np.minimum(keys + hold, last), np.arange(len(tcp)))
+    key = np.searchsorted(until, np.arange(len(tcp)))
     return np.concatenate([tcp[keys], after], 1)[key]
 
 
@@ -68,9 +76,30 @@ def features(pose: Float[Tensor, "b 10"], noise: BatchNoise | None = None) -> Fl
     return torch.cat([away / _POSITION, away / (away.abs() + _NEAR), pose[:, 3:]], 1)
 
 
-def reached(pose: Float[Tensor, "b 10"]) -> Bool[Tensor, " b"]:
-    """Return whether the hand is at key poses in its frame, as well as sight can tell."""
-    return pose[:, :3].norm(dim=1) < _REACHED
+def gripper_plan(
+    pose: Float[Tensor, "b 10"],
+    tcp: Float[Tensor, "b o 7"],
+    planned: Float[Tensor, "b h"],
+    width: float,
+    widths: tuple[float, ...],
+) -> Float[Tensor, "b h"]:
+    """Return the planned widths, as sight allows: `width` is kept until the hand rests at the next key pose.
+
+    Then a gripper of two widths changes at the latest: the head alone, which sees the pose with noise,
+    often does not plan to, even where recordings change within the plan more often than not.
+
+    Args:
+        pose: of the next key pose in the hand's frame.
+        tcp: of the observed ticks.
+    """
+    away = pose[:, :3].norm(dim=1)[:, None]
+    moved = (tcp[:, 1:, :3] - tcp[:, :-1, :3]).norm(dim=2)
+    rests = (moved < _STILL).all(1, keepdim=True)
+    planned = planned.where(rests & (away < _REACHED), width)
+    if len(widths) > 2:  # noqa: PLR2004
+        return planned
+    after = torch.where(pose[:, 9:] > 0.5, min(widths), max(widths))
+    return torch.where(rests & (away < _AT), after, planned)
 
 
 def set_beside(
