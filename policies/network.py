@@ -279,6 +279,7 @@ class PolicyNetwork(nn.Module):
         cameras the gripper keeps it until the hand is at the next key pose. `average` is that of the
         key poses seen in the episode; without it only the latest images count.
         """
+        keeps = average is not None and average.gripper_moves
         pose = self._see(batch, average)
         encoded = self._encode(batch, self._encode_touch(batch), pose)
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
@@ -287,7 +288,8 @@ class PolicyNetwork(nn.Module):
             actions[..., -1] = nearest(actions[..., -1], widths)
             if pose is not None and width is not None:
                 tcp = torch.stack([self._hand(state)[0] for state in batch.state.unbind(1)], 1)
-                actions[..., -1] = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)
+                seen = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)
+                actions[..., -1] = width if keeps else seen
         return actions
 
     def _see(

@@ -34,7 +34,7 @@ _BESIDE = 0.02, 0.02, 0.01, 0.2  # m along the hand's axes, rad about its z axis
 _BACK = 10  # ticks
 _REACHED = 0.02  # m
 _AT = math.sqrt(3) * _NOISE  # m; the training's noise: the head cannot tell it from there
-_STILL = 0.0005  # m per tick
+_STILL = 0.0002  # m per tick
 _MEMORY = 1.0  # s after which an estimate weighs 1/e in the average
 
 
@@ -241,6 +241,11 @@ class KeyPoseAverage:
         self._hold = math.ceil(HOLD_SECONDS / plan_seconds)
         self._alone = 0  # estimates still to come that stand alone
         self._weight, self._mean = torch.zeros(1, 2), torch.zeros(1, _POSE + 1)
+
+    @property
+    def gripper_moves(self) -> bool:
+        """Return whether the gripper was commanded to change within `HOLD_SECONDS`."""
+        return self._alone > 0
 
     def restart(self) -> None:
         """Forget what was: the gripper changes, and the next key pose is another."""
