@@ -12,9 +12,11 @@ from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.teleoperation.config import TeleoperationConfig
 
+_MORE = 2  # times as much as a led hand: a policy sees where to stop less well than the person who led it
+
 
 class YieldingActor(Actor):
-    """Adds to another actor's actions the motion with which a teleoperated hand yields.
+    """Adds to another actor's actions the motion with which a hand yields, twice that of a led one.
 
     The policy learned from demonstrations in which it did; without it the hand presses harder.
     """
@@ -26,7 +28,7 @@ class YieldingActor(Actor):
         hand = TeleoperationConfig()
         self._actor, self._commanded, self._dt = actor, commanded, safety.dt
         self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
-        self._compliance = Compliance(hand.compliance, hand.rotational_compliance)
+        self._compliance = Compliance(_MORE * hand.compliance, _MORE * hand.rotational_compliance)
 
     def start(self, observation: Observation) -> None:
         """See Actor; the first wrench is that of the free hand."""
