@@ -167,7 +167,7 @@ def test_a_policy_of_ones_own_task_yields_as_a_led_hand_does() -> None:
     assert not hand.act({ft.WRENCH: 1.0 + np.array([0, 0, 2.9, 0, 0, 0])})[:7].any()
     action = hand.act({ft.WRENCH: 1.0 + np.array([0, 0, 10.0, 0, 0, 0])})
     moved = kinematics.forward(q + action[:7])[0] - kinematics.forward(q)[0]
-    np.testing.assert_allclose([*moved, action[7]], [0, 0, TICK * 2e-3 * 7, 0.05], atol=1e-5)
+    np.testing.assert_allclose([*moved, action[7]], [0, 0, TICK * 4e-3 * 7, 0.05], atol=1e-5)
 
 
 CELL = """
