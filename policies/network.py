@@ -62,7 +62,7 @@ class PolicyConfig:
     # likewise on joint and TCP positions, the same for all observed ticks, so that the network
     # cannot infer a wire's course from its place on the table. "body_twist" reads no positions
     position_noise: float = 0.3
-    # m, the only widths that the demonstrations command. A predicted width becomes the nearest of
+    # m, the only two widths that the demonstrations command. A predicted width becomes the nearest of
     # them, because the hand would stop at one in between. Empty: any width
     gripper_widths: tuple[float, ...] = ()
     end_to_end: EndToEndConfig | None = None  # touch encoder that is trained jointly; None without

@@ -85,19 +85,18 @@ def gripper_plan(
 ) -> Float[Tensor, "b h"]:
     """Return the planned widths, as sight allows: `width` is kept until the hand rests at the next key pose.
 
-    Then a gripper of two widths changes at the latest: the head alone, which sees the pose with noise,
-    often does not plan to, even where recordings change within the plan more often than not.
+    Then the gripper changes at the latest: the head alone, which sees the pose with noise, often does not
+    plan to, even where recordings change within the plan more often than not.
 
     Args:
         pose: of the next key pose in the hand's frame.
         tcp: of the observed ticks.
+        widths: the two that are commanded.
     """
     away = pose[:, :3].norm(dim=1)[:, None]
     moved = (tcp[:, 1:, :3] - tcp[:, :-1, :3]).norm(dim=2)
     rests = (moved < _STILL).all(1, keepdim=True)
     planned = planned.where(rests & (away < _REACHED), width)
-    if len(widths) > 2:  # noqa: PLR2004
-        return planned
     after = torch.where(pose[:, 9:] > 0.5, min(widths), max(widths))
     return torch.where(rests & (away < _AT), after, planned)
 

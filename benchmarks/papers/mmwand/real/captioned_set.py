@@ -30,8 +30,8 @@ def embed_captioned(root: Path, encoders: tuple[str, ...], seed: int, cache: Pat
     """Embed TVL once and keep it in a cache; UserError: see `read_tvl`, or no such encoder."""
     touches, towers = read_tvl(root), load_towers("offline")
     untouched = _median(touches)
-    captions = [", ".join(touch.words) for touch in touches]
-    names, presses = sorted(set(captions)), sorted({touch.press for touch in touches})
+    names, label = np.unique([", ".join(t.words) for t in touches], return_inverse=True)
+    _, press = np.unique([t.press for t in touches], return_inverse=True)
     files = [f"{t.touch.relative_to(root)} {t.touch.stat().st_size}" for t in touches]
     keep = partial(cached, cache, hashlib.sha256("\n".join(files).encode()).hexdigest())
     made = {}
@@ -40,18 +40,16 @@ def embed_captioned(root: Path, encoders: tuple[str, ...], seed: int, cache: Pat
         what = touch_key(embed, *_pictures(touches[0], untouched))
         made[name] = keep(what, lambda embed=embed: _embed(touches, untouched, embed))
     return EmbeddedSet(
-        names=tuple(names),
+        names=tuple(names.tolist()),
         sensor="digit",
-        label=np.array([names.index(caption) for caption in captions]),
-        visit=np.array([presses.index(touch.press) for touch in touches]),
-        sentences=tuple(names),
+        label=label,
+        visit=press,
+        sentences=tuple(names.tolist()),
         describes=np.eye(len(names), dtype=bool),
-        texts=towers.embed_texts(names).numpy(),
+        texts=towers.embed_texts(names.tolist()).numpy(),
         image=keep(f"view {towers.name}", lambda: _embed_views(touches, towers)),
         touch=made,
-        pixels=keep(
-            "pixels", lambda: np.stack([small_change(*_pictures(t, untouched)) for t in touches])
-        ),
+        pixels=keep("pixels", lambda: _pixels(touches, untouched)),
     )
 
 
@@ -81,6 +79,11 @@ def _embed(
         own, touched = _pictures(touch, untouched)
         rows.append(embed(touched[None], own)[0])
     return np.stack(rows).astype(np.float32)
+
+
+def _pixels(touches: list[CaptionedTouch], untouched: Picture) -> Float32[np.ndarray, "n d"]:
+    reading = track(touches, "reading pixels", "touch")
+    return np.stack([small_change(*_pictures(touch, untouched)) for touch in reading])
 
 
 def _embed_views(touches: list[CaptionedTouch], towers: Towers) -> Float32[np.ndarray, "n 1 i"]:
