@@ -6,6 +6,7 @@ The block that is picked up and placed over the wire: test_documented_commands.p
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import time
 from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -123,6 +125,17 @@ def test_a_disk_that_fills_up_costs_one_episode_and_is_said_in_a_line(
     assert "ticks of the control loop" in printed.out and "ended: time is up" in printed.out
     assert "could not be saved" in f"{ended.value.code}{printed.err}"
     assert len(EpisodeSet(tmp_path / "run" / "episodes")) == 1
+
+
+def test_a_longer_run_needs_more_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=0.8e9))
+    codes = []
+    for seconds in (60.0, 0.2):
+        cell = write_cell_file(tmp_path, SIM.replace("seed = 3", f"seed = 3, seconds = {seconds}"))
+        with pytest.raises(SystemExit) as ended:
+            run("deploy", cell, "--execute", "--yes", "--out", tmp_path / f"{seconds:g}")
+        codes.append(ended.value.code)
+    assert "make room for 1.1 GB" in str(codes[0]) and codes[1] == NOT_DONE  # time is up
 
 
 def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:

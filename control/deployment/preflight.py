@@ -31,7 +31,8 @@ _MIN_RATE_SHARE = 0.8  # share of the camera rate that the cell file states
 _TOUCHED_COUNTS = 12.0
 _WATCH_SECONDS = 1.0  # s for which cameras are watched
 _MAX_REST_FORCE = 7.5  # N measured at rest above which the arm does not begin
-_MIN_FREE_BYTES = 2e9  # bytes: a 40 s episode with both fingertips takes 0.4 GB at most
+_EPISODE_RATE = 1e7  # bytes/s: 40 s with both fingertips take 0.4 GB at most
+_SPARE_BYTES = 5e8  # left free beside the episode
 _MUJOCO = ClientLibrary("mujoco", "pip install mujoco")
 _CLIENTS = {"fr3": FRANKY, "ur5e": UR_RTDE, "sim": _MUJOCO}
 
@@ -68,7 +69,7 @@ def preflight(
         checks.append(("load cell", lambda: _load_cell(connection)))
     checks += [
         ("policy", lambda: f"{cell.task.policy}, at {ft.CONTROL_HZ} Hz"),
-        ("disk", lambda: _disk(episodes)),
+        ("disk", lambda: _disk(episodes, cell.task.seconds)),
         ("episodes", lambda: f"{count_episodes()} recorded in {episodes}"),
     ]
     return [_run_check(*check) for check in checks]
@@ -224,11 +225,11 @@ def _load_cell(connection: CellConnection) -> str:
     return f"{reading.force:.1f} N, {reading.rejected} lines refused"
 
 
-def _disk(episodes: Path) -> str:
+def _disk(episodes: Path, seconds: float) -> str:
     folder = next(p for p in (episodes, *episodes.resolve().parents) if p.exists())
-    free = shutil.disk_usage(folder).free
-    if free < _MIN_FREE_BYTES:
+    free, needed = shutil.disk_usage(folder).free, _SPARE_BYTES + _EPISODE_RATE * seconds
+    if free < needed:
         raise UserError(
-            f"{free / 1e9:.1f} GB are free in {folder}: make room for {_MIN_FREE_BYTES / 1e9:g} GB"
+            f"{free / 1e9:.1f} GB are free in {folder}: make room for {needed / 1e9:.1f} GB"
         )
     return f"{free / 1e9:.0f} GB free"
