@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from touchgoal.control.features import CAMERA_SHAPE, CONTROL_HZ
+from touchgoal.control.features import CONTROL_HZ
 from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import DeviceName
 from touchgoal.runtime.errors import UserError
@@ -49,7 +49,7 @@ class Config:
     seed: Seed | None = None
     """Random seed of the first scene, in place of the cell file's; each further one adds one (simulated
     arm or twin only)."""
-    camera_size: Annotated[tuple[Count, Count], RARE] = CAMERA_SHAPE[:2]
+    camera_size: Annotated[tuple[Count, Count], RARE] = (256, 256)
     """Rows and columns of the recorded camera images, px."""
     hand: TeleoperationConfig = TeleoperationConfig()
     """Response of the hand to the device."""

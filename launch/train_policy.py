@@ -58,7 +58,7 @@ _SIGHT = {
     "head": "mlp",
     "action_share": 0.98,
     "execution_horizon": 6,
-    "train": TrainConfig(epochs=12, batch_size=32, lr=1e-3, warmup=300, snapshot_epochs=4),
+    "train": TrainConfig(epochs=10, batch_size=64, lr=3e-3, warmup=300, snapshot_epochs=5),
     "sampler": SamplerConfig(loss="absolute"),
 }
 

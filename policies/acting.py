@@ -142,7 +142,7 @@ class LearnedPolicy:
             rest = self._generator, self._width, self._key_pose
             actions = self._network.plan(batch, *rest)[0].numpy()
             width = float(actions[self.config.execution_horizon - 1, -1])
-            if width != self._width:
+            if self._width not in (None, width):
                 self._key_pose.restart()
             self._width = width
             return actions

@@ -183,7 +183,7 @@ class PolicyNetwork(nn.Module):
         wrench: Float[Tensor, "n 12"] | None = None,
         action_is_pad: Bool[Tensor, "m h"] | None = None,
         maps: Float16[Tensor, "n k c y x"] | None = None,
-        key_pose: Float[Tensor, "n 8"] | None = None,
+        key_pose: Float[Tensor, "n 2 8"] | None = None,
     ) -> None:
         """Fit the normalizers to training data: n ticks, and the chunks of m windows.
 
@@ -220,7 +220,7 @@ class PolicyNetwork(nn.Module):
         noise: BatchNoise,
         wrench: Float[Tensor, "b o 12"] | None = None,
         action_is_pad: Bool[Tensor, "b h"] | None = None,
-        key_pose: Float[Tensor, "b 8"] | None = None,
+        key_pose: Float[Tensor, "b 2 8"] | None = None,
     ) -> Float[Tensor, ""]:
         """Return the training loss on windows, without ticks after the episode's end.
 
@@ -251,11 +251,16 @@ class PolicyNetwork(nn.Module):
 
     @torch.no_grad()
     def key_pose_error(
-        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 8"]
-    ) -> Float[Tensor, " b"]:
-        """Return how far off sight sees the next key pose, m."""
+        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 2 8"]
+    ) -> Float[Tensor, "b 2"]:
+        """Return how far off sight sees the next key pose and the one after it, m."""
         assert self.key_pose and batch.maps is not None, "needs cameras"
         return self.key_pose.error(batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose)
+
+    def calibrate_sight(self, batch: ObservationBatch, key_pose: Float[Tensor, "b 2 8"]) -> None:
+        """Scale the errors that the cameras expect to those on episodes that were not trained on."""
+        assert self.key_pose and batch.maps is not None, "needs cameras"
+        self.key_pose.calibrate(batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose)
 
     def _hand(
         self, state: Float[Tensor, "b s"]
@@ -301,7 +306,7 @@ class PolicyNetwork(nn.Module):
         assert batch.maps is not None, "needs the cameras' feature maps"
         tcp, width = self._hand(batch.state[:, -1])
         pose, weight = self.key_pose(batch.maps.float(), tcp, width)
-        return average.add(pose, weight, tcp) if average else pose
+        return average.add(pose, weight, tcp) if average else pose[:, 0]
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from scipy.spatial.transform import Rotation
 
 from touchgoal.control import features as ft
@@ -15,6 +16,7 @@ from touchgoal.policies.perception.key_pose import (
     KeyPoseAverage,
     KeyPoseReadout,
     _columns,
+    _errors,
     _in_hand_frame,
     next_key_poses,
     set_beside,
@@ -22,21 +24,55 @@ from touchgoal.policies.perception.key_pose import (
 
 
 @pytest.mark.parametrize(
-    ("widths", "lengths", "hold", "keys", "closed"),
+    ("widths", "lengths", "hold", "keys", "following", "closed"),
     [
-        ([0.08, 0.08, 0.0, 0.0, 0.0, 0.08, 0.08], [7], 0, [1, 1, 4, 4, 4, 4, 4], "1100000"),
-        ([0.08, 0.0, 0.0, 0.08, 0.0, 0.0], [3, 3], 0, [0, 2, 2, 3, 5, 5], "111111"),
-        ([0.08, 0.0, 0.0, 0.0, 0.0, 0.08], [4, 2], 2, [0, 0, 0, 3, 4, 4], "111100"),
-        ([0.05, 0.0501, 0.05, 0.0502], [2, 2], 0, [1, 1, 3, 3], "0000"),  # noise on one width
+        (
+            [0.08, 0.08, 0.0, 0.0, 0.0, 0.08, 0.08],
+            [7],
+            0,
+            [1, 1, 4, 4, 4, 4, 4],
+            [4] * 7,
+            "1100000",
+        ),
+        (
+            [0.08, 0.0, 0.0, 0.08, 0.0, 0.0],
+            [3, 3],
+            0,
+            [0, 2, 2, 3, 5, 5],
+            [2, 2, 2, 5, 5, 5],
+            "111111",
+        ),
+        (
+            [0.08, 0.0, 0.0, 0.0, 0.0, 0.08],
+            [4, 2],
+            2,
+            [0, 0, 0, 3, 4, 4],
+            [3, 3, 3, 3, 4, 4],
+            "111100",
+        ),
+        (
+            [0.05, 0.0501, 0.05, 0.0502],
+            [2, 2],
+            0,
+            [1, 1, 3, 3],
+            [1, 1, 3, 3],
+            "0000",
+        ),  # noise on one width
     ],
 )
 def test_a_key_pose_is_where_the_gripper_changes_or_the_episode_ends(
-    widths: list[float], lengths: Sequence[int], hold: int, keys: list[int], closed: str
+    widths: list[float],
+    lengths: Sequence[int],
+    hold: int,
+    keys: list[int],
+    following: list[int],
+    closed: str,
 ) -> None:
     tcp = np.random.default_rng(0).normal(size=(len(widths), 7)).astype(np.float32)
-    found = next_key_poses(tcp, np.array(widths, np.float32), lengths, hold)
+    found, then = next_key_poses(tcp, np.array(widths, np.float32), lengths, hold).swapaxes(0, 1)
     np.testing.assert_array_equal(found[:, :7], tcp[keys])
     assert "".join(f"{after:.0f}" for after in found[:, 7]) == closed
+    np.testing.assert_array_equal(then[:, :7], tcp[following])
 
 
 def _poses(rng: np.random.Generator, n: int) -> torch.Tensor:
@@ -64,9 +100,10 @@ def test_a_camera_finds_a_thing_at_places_never_seen(camera: str) -> None:
     key[:, 2] = 0.02
     R = Rotation.from_quat(tcp[:, 3:].numpy(), scalar_first=True)
     key = torch.cat([key, (key[:, 1:2] > 0).float()], 1)  # the gripper closes on the left side
-    seen = key[:, :2].numpy() - [0.5, 0.0]
+    key = torch.stack([key, key + torch.eye(8)[2] / 10], 1)  # and the hand goes up by 10 cm
+    seen = key[:, 0, :2].numpy() - [0.5, 0.0]
     if camera == ft.WRIST:
-        seen = R.inv().apply((key[:, :7] - tcp)[:, :3].numpy())[:, :2] / 2
+        seen = R.inv().apply((key[:, 0, :7] - tcp)[:, :3].numpy())[:, :2] / 2
     maps = _maps(seen / 0.2 * 4 + 5.5)[:, None]
     torch.manual_seed(0)
     readout = KeyPoseReadout(ImageInputConfig((camera,), (96, 96)))
@@ -79,16 +116,22 @@ def test_a_camera_finds_a_thing_at_places_never_seen(camera: str) -> None:
         loss.backward()
         optimizer.step()
     off = readout.error(maps[512:].float(), tcp[512:], width[512:], key[512:])
-    assert off.median() < 0.025  # where guessing the mean place is 0.1 m off
-    closes = readout(maps[512:].float(), tcp[512:], width[512:])[0][:, 9] > 0.5
+    assert (off.median(0).values < 0.025).all()  # where guessing the mean place is 0.1 m off
+    closes = readout(maps[512:].float(), tcp[512:], width[512:])[0][:, 0, 9] > 0.5
     if camera == ft.FRONT:  # the hand's camera does not know where the left side is
-        assert (closes == key[512:, 7].bool()).float().mean() > 0.9
+        assert (closes == key[512:, 0, 7].bool()).float().mean() > 0.9
+    readout.calibration += 1.0
+    rows = maps[512:].float(), tcp[512:], width[512:]
+    readout.calibrate(*rows, key[512:])
+    _, expected, _ = readout._estimates(*rows)
+    made = _errors(readout._estimates(*rows)[0], tcp[512:], key[512:])
+    torch.testing.assert_close((made / expected.exp()).mean(0), torch.ones(1, 2, 3))
 
 
 def test_poses_turn_into_the_hands_frame_as_scipy_turns_them() -> None:
     rng = np.random.default_rng(2)
     tcp, key = _poses(rng, 20), _poses(rng, 20)
-    found = _in_hand_frame(tcp, _columns(key)).numpy()
+    found = _in_hand_frame(tcp, _columns(F.pad(key, (0, 1))[:, None]))[:, 0].numpy()
     R = Rotation.from_quat(tcp[:, 3:].numpy(), scalar_first=True)
     np.testing.assert_allclose(found[:, :3], R.inv().apply((key - tcp)[:, :3].numpy()), atol=1e-5)
     turned = (R.inv() * Rotation.from_quat(key[:, 3:].numpy(), scalar_first=True)).as_matrix()
@@ -98,21 +141,24 @@ def test_poses_turn_into_the_hands_frame_as_scipy_turns_them() -> None:
 
 def test_the_average_of_a_moving_hand_steadies_and_follows_the_gripper() -> None:
     rng, average = np.random.default_rng(3), KeyPoseAverage(0.3)
-    tcp, keys = _poses(rng, 60), _poses(rng, 2)
+    tcp, keys = _poses(rng, 60), F.pad(_poses(rng, 3), (0, 1), value=1.0)
     off = []
     for tick, hand in enumerate(tcp[:, None]):
         if tick == 30:
             average.restart()
-        true = _in_hand_frame(hand, torch.cat([_columns(keys[[tick // 30]]), torch.ones(1, 1)], 1))
+        stage = int(tick >= 32)  # for half a second the fingers move
+        assert average.gripper_moves == (tick in (30, 31))
+        true = F.pad(_columns(keys[None, stage : stage + 2]), (0, 1), value=1.0)
+        true = _in_hand_frame(hand, true)
         hidden = tick % 3 == 2  # and the estimate says so
-        noise = torch.from_numpy(rng.normal(0, 0.1 if hidden else 0.01, (1, 10))).float()
-        weight = torch.full((1, 2), 1.0 if hidden else 100.0)
+        noise = torch.from_numpy(rng.normal(0, 0.1 if hidden else 0.01, (1, 2, 10))).float()
+        weight = torch.full((1, 2, 3), 1.0 if hidden else 100.0)
         found = average.add(true + noise, weight, hand)
-        off.append(((found - true)[0, :3].norm() / noise[0, :3].norm()).item())
+        off.append(((found - true[:, 0])[0, :3].norm() / noise[0, 0, :3].norm()).item())
     assert off[0] == pytest.approx(1, abs=1e-3)
-    assert off[30:32] == pytest.approx([1, 1], abs=1e-3)  # nothing is left of the first key pose
-    assert np.median(off[40:]) < 0.6
-    assert np.median(off[11:30:3] + off[41::3]) < 0.2  # where it is hidden
+    assert max(off[30:33]) < 1  # what followed has been seen all along
+    assert np.median(off[10:]) < 0.6
+    assert np.median(off[11::3]) < 0.2  # where it is hidden
 
 
 def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:
@@ -155,7 +201,7 @@ def test_the_gripper_changes_where_the_hand_rests_at_a_key_pose_and_no_velocity_
     torch.nn.init.zeros_(last.weight)
     torch.nn.init.zeros_(last.bias)  # at the key pose
     for sees_closed, width in ((5.0, 0.0), (-5.0, 0.08)):
-        last.bias.data[-1] = sees_closed
+        last.bias.data[12] = sees_closed
         assert (widths(0.0) == width).all() and (widths(0.08) == width).all()
     state[:, 0, 17] += 0.002  # moving on
     assert (widths(0.0) == 0).all() and (widths(0.08) == 0.08).all()

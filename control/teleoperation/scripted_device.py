@@ -1,8 +1,9 @@
 """Scripted teleoperation device for rehearsals without a person: it picks and places.
 
 A simulator gives it the poses of object and goal. It requests hand motions, as a SpaceMouse does,
-from the observed pose of the hand and width of the gripper. As people do, it goes down beside its
-aim and corrects: a policy learns corrections from no other demonstrations (DART, Laskey et al. 2017).
+from the observed pose of the hand and width of the gripper. As people do, it goes no two ways alike,
+comes down beside its aim and corrects: a policy learns corrections from no other demonstrations
+(DART, Laskey et al. 2017), and to see from no other places.
 """
 
 from collections import deque
@@ -19,9 +20,13 @@ from touchgoal.control.teleoperation.device import GripperRequest, HandMotion, T
 
 _SLOW_WITHIN = 0.06, 0.4  # m and rad from a way-point within which the deflection shrinks
 _REACHED, _PASSED = (0.004, 0.03), (0.012, 0.1)  # m and rad from a way-point
-_CLEARANCE = 0.12  # m above the object
-# On its way down: m above the end, and beside it (standard deviations) m along each axis and rad
-_BESIDE = (_CLEARANCE, 0.02, 0.25), (0.04, 0.008, 0.1)
+_CLEARANCE = 0.07, 0.16  # m above the object, between which the hand goes
+# Standard deviations of its way-points, half-way, above and low above the end: m along each axis, and rad
+# with an open hand, which turns as late as it can, and with an object
+_ASIDE = 0.04, 0.02, 0.008
+_TURNED = {"open": (0.8, 0.5, 0.2), "close": (0.1, 0.1, 0.1)}
+_MOST_TURNED = 1.8  # rad about the vertical that the arm reaches everywhere on the table
+_LOW = 0.04  # m
 _STILL_TICKS = 8  # ticks without motion: the hand has closed, or the table blocks it
 _STILL = 4e-4  # m of position and of width that count as no motion
 _PLACED = 0.015  # m between hand and goal
@@ -49,20 +54,27 @@ class ScriptedDevice(TeleoperationDevice):
         pick, put = np.array([x, y, z]), np.array([*self._poses.goal, z])
         yield from self._go_down(pick, "open")
         yield from self._wait("close")
-        yield from self._go(pick + [0, 0, _CLEARANCE], 0.0, "close", _REACHED)
+        yield from self._go(self._above(pick), 0.0, "close", _REACHED)
         yield from self._go_down(put, "close")
         there = np.linalg.norm((self._position - put)[:2]) < _PLACED and self._width > _HELD
         yield from self._wait("open")
-        yield from self._go(put + [0, 0, _CLEARANCE], 0.0, "open", _PASSED)
+        yield from self._go(self._above(put), 0.0, "open", _PASSED)
         self.verdict = "done" if there else "not done"
         while True:
             yield HandMotion(np.zeros(6), "open")
 
     def _go_down(self, point: Vector3, gripper: GripperRequest) -> Iterator[HandMotion]:
-        for height, away, turn in _BESIDE:
-            beside = np.append(self._rng.normal(0, away, 2), height)
-            yield from self._go(point + beside, self._rng.normal(0, turn), gripper, _PASSED)
+        half = self._above(np.append((self._position + point)[:2] / 2, point[2]))
+        way = half, self._above(point), point + [0, 0, _LOW]
+        for height, away, turned in zip(way, _ASIDE, _TURNED[gripper], strict=True):
+            beside = height + np.append(self._rng.normal(0, away, 2), 0)
+            yaw = self._poses.grasp[3]
+            turn = np.clip(yaw + self._rng.normal(0, turned), -_MOST_TURNED, _MOST_TURNED) - yaw
+            yield from self._go(beside, turn, gripper, _PASSED)
         yield from self._go(point, 0.0, gripper, _REACHED)
+
+    def _above(self, point: Vector3) -> Vector3:
+        return point + [0, 0, self._rng.uniform(*_CLEARANCE)]
 
     def _go(
         self, point: Vector3, turn: float, gripper: GripperRequest, near: tuple[float, float]

@@ -17,6 +17,7 @@ from touchgoal.policies.perception.keypoints import keypoints
 from touchgoal.runtime.errors import UserError
 
 MAP_CHANNELS = 40  # of `EfficientNetLite0.fine_map`
+_SHARPNESS = 10.0  # of the softmax: keypoints all begin in the middle, and soon leave it
 _BATCH = 4  # images; the activations of more leave the cache
 
 
@@ -26,9 +27,8 @@ class ImageInputConfig:
 
     cameras: tuple[str, ...]  # columns such as observation.images.front
     size: tuple[int, int]  # rows and columns of their images, px
-    hidden: int = 32  # channels of the convolution that the keypoints are found by
-    keypoints: int = 16  # of each image
-    features: int = 8  # of each keypoint
+    hidden: int = 32  # channels of the convolutions that the keypoints are found by
+    keypoints: int = 32  # of each image
 
     @property
     def on_hand(self) -> tuple[bool, ...]:
@@ -82,7 +82,10 @@ def _network() -> EfficientNetLite0:
 
 
 class ImageReadout(nn.Module):
-    """Network from the feature maps of one camera to keypoints, with their features."""
+    """Network from the feature maps of one camera to the places of keypoints, and nothing else.
+
+    By features of the keypoints it would recognise each recorded scene.
+    """
 
     def __init__(self, config: ImageInputConfig) -> None:
         super().__init__()
@@ -92,13 +95,15 @@ class ImageReadout(nn.Module):
         self.layers = nn.Sequential(
             nn.Conv2d(MAP_CHANNELS, config.hidden, 3, padding=1),
             nn.ReLU(),
-            nn.Conv2d(config.hidden, config.keypoints + config.features, 1),
+            nn.Conv2d(config.hidden, config.hidden, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(config.hidden, config.keypoints, 1),
         )
 
     @staticmethod
     def width(config: ImageInputConfig) -> int:
         """Return the width of the output."""
-        return config.keypoints * (2 + config.features)
+        return 2 * config.keypoints
 
     def fit(self, maps: Float16[Tensor, "n c y x"]) -> None:
         """Fit mean and standard deviation of each channel to training data."""
@@ -107,6 +112,5 @@ class ImageReadout(nn.Module):
         self.std.copy_(sample.std((0, 2, 3)).clamp(min=1e-3)[:, None, None])
 
     def forward(self, maps: Float[Tensor, "b c y x"]) -> Float[Tensor, "b p"]:
-        """Return place and features of each keypoint."""
-        found = self.layers((maps - self.mean) / self.std)
-        return keypoints(*found.split([self.config.keypoints, self.config.features], 1))
+        """Return the place of each keypoint."""
+        return keypoints(_SHARPNESS * self.layers((maps - self.mean) / self.std), maps[:, :0])

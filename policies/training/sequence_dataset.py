@@ -35,7 +35,7 @@ class Recordings:
     pictures: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
     wrench: Float32[Tensor, "n 12"] | None = None  # on both pads (N, Nm, pad frames), if trained on
     maps: Float16[Tensor, "n k c y x"] | None = None  # of the cameras, see `ImageEmbedder`
-    key_pose: Float32[Tensor, "n 8"] | None = None  # the next one, beside `maps`
+    key_pose: Float32[Tensor, "n 2 8"] | None = None  # the next two, beside `maps`
 
 
 def load_recordings(
@@ -205,6 +205,6 @@ class SequenceDataset:
         wrench = self.recorded.wrench
         return None if wrench is None else wrench[self._observed[rows]]
 
-    def key_pose(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b 8"] | None:
-        """Return the next key pose at the latest tick of some windows, with cameras."""
+    def key_pose(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b 2 8"] | None:
+        """Return the next key poses at the latest tick of some windows, with cameras."""
         return None if self.recorded.key_pose is None else self.recorded.key_pose[rows]

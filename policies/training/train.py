@@ -62,6 +62,9 @@ def train(
     def save_snapshot(history: list[dict[str, float]], provenance: dict[str, Any]) -> None:
         known = {"train": asdict(config), "windows": len(windows), "metrics": history[-1]}
         last = len(history) == config.epochs
+        if averaged.key_pose:
+            batch = _validation_batch(averaged, validation, config)
+            averaged.calibrate_sight(_observed(batch), batch["key_pose"])
         folders = [out_dir / POLICY] if last else []
         if last or len(history) % config.snapshot_epochs == 0:
             folders.append(out_dir / SNAPSHOTS / f"epoch-{len(history):04d}")
@@ -124,7 +127,7 @@ class _PolicyLoss(nn.Module):
         wrench: Float[Tensor, "b o 12"] | None,
         actions: Float[Tensor, "b h 8"],
         action_is_pad: Bool[Tensor, "b h"],
-        key_pose: Float[Tensor, "b 8"] | None,
+        key_pose: Float[Tensor, "b 2 8"] | None,
         noise: BatchNoise,
     ) -> dict[str, Tensor]:
         batch = ObservationBatch(touch, state, pictures, maps)
@@ -145,17 +148,28 @@ def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, 
     }
 
 
+def _validation_batch(
+    policy: PolicyNetwork, windows: SequenceDataset, config: TrainConfig
+) -> dict[str, Any]:
+    """Return windows from all over the validation episodes, on the policy's device."""
+    n = min(config.validation_windows, len(windows))
+    rows = torch.linspace(0, len(windows) - 1, n).long()
+    device = policy.action_normalizer.scale.device
+    return cast(dict[str, Any], send_to_device(_make_batch(windows, rows), device))
+
+
+def _observed(batch: dict[str, Any]) -> ObservationBatch:
+    return ObservationBatch(*(batch[name] for name in ("touch", "state", "pictures", "maps")))
+
+
 @torch.no_grad()
 def _validate(
     policy: PolicyNetwork, windows: SequenceDataset, config: TrainConfig, seed: int
 ) -> dict[str, float]:
     """Return the loss, the error of the joint change (rad) planned over the chunk, and of sight (m)."""
-    n = min(config.validation_windows, len(windows))
-    rows = torch.linspace(0, len(windows) - 1, n).long()
-    device = policy.action_normalizer.scale.device
-    batch = send_to_device(_make_batch(windows, rows), device)
+    batch = _validation_batch(policy, windows, config)
     generator = torch.Generator().manual_seed(seed)
-    observed = ObservationBatch(*(batch[name] for name in ("touch", "state", "pictures", "maps")))
+    observed = _observed(batch)
     planned = policy.plan(observed, generator)
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
@@ -171,7 +185,7 @@ def _validate(
     metrics = {"validation_loss": loss.item(), "validation_error": error.item()}
     if batch["key_pose"] is not None:
         off = policy.key_pose_error(observed, batch["key_pose"])
-        metrics["validation_key_pose_error"] = off.median().item()
+        metrics["validation_key_pose_error"] = off[:, 0].median().item()
     return metrics
 
 
