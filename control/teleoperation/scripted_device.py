@@ -24,9 +24,9 @@ _CLEARANCE = 0.07, 0.16  # m above the object, between which the hand goes
 # Standard deviations of its way-points, half-way, above and low above the end: m along each axis, and rad
 # with an open hand, which turns as late as it can, and with an object
 _ASIDE = 0.04, 0.02, 0.008
-_TURNED = {"open": (0.8, 0.5, 0.2), "close": (0.1, 0.1, 0.1)}
+_TURNED = {"open": (0.8, 0.5, 0.1), "close": (0.1, 0.1, 0.1)}
 _MOST_TURNED = 1.8  # rad about the vertical that the arm reaches everywhere on the table
-_LOW = 0.04  # m
+_LOW = 0.06  # m; the fingertips are above what is grasped
 _STILL_TICKS = 8  # ticks without motion: the hand has closed, or the table blocks it
 _STILL = 4e-4  # m of position and of width that count as no motion
 _PLACED = 0.015  # m between hand and goal
@@ -39,6 +39,7 @@ class ScriptedDevice(TeleoperationDevice):
     def __init__(self, poses: PickPlacePoses, seed: int) -> None:
         self._poses, self._rng = poses, np.random.default_rng(seed)
         self._recent: deque[np.ndarray] = deque(maxlen=_STILL_TICKS)  # position and width, m
+        self._yaw = poses.grasp[3]  # of the hand at the object, rad
         self._motions = self._run()
 
     def read(self, observation: Observation) -> HandMotion:
@@ -68,10 +69,17 @@ class ScriptedDevice(TeleoperationDevice):
         way = half, self._above(point), point + [0, 0, _LOW]
         for height, away, turned in zip(way, _ASIDE, _TURNED[gripper], strict=True):
             beside = height + np.append(self._rng.normal(0, away, 2), 0)
-            yaw = self._poses.grasp[3]
-            turn = np.clip(yaw + self._rng.normal(0, turned), -_MOST_TURNED, _MOST_TURNED) - yaw
-            yield from self._go(beside, turn, gripper, _PASSED)
+            yaw = np.clip(self._yaw + self._rng.normal(0, turned), -_MOST_TURNED, _MOST_TURNED)
+            yield from self._go(beside, yaw - self._yaw, gripper, _PASSED)
+            if gripper == "open":
+                self._yaw = self._shorter_turn()
         yield from self._go(point, 0.0, gripper, _REACHED)
+
+    def _shorter_turn(self) -> float:
+        """Return the yaw to grasp at that is nearest to the hand's: half a turn on is as good."""
+        now = np.arctan2(self._R[1, 0], self._R[0, 0])
+        yaws = self._poses.grasp[3] + np.pi * np.arange(-1, 2)
+        return float(min(yaws[np.abs(yaws) < _MOST_TURNED], key=lambda yaw: abs(yaw - now)))
 
     def _above(self, point: Vector3) -> Vector3:
         return point + [0, 0, self._rng.uniform(*_CLEARANCE)]
@@ -79,9 +87,9 @@ class ScriptedDevice(TeleoperationDevice):
     def _go(
         self, point: Vector3, turn: float, gripper: GripperRequest, near: tuple[float, float]
     ) -> Iterator[HandMotion]:
-        """Go to a way-point, turned by `turn` (rad) from the grasp, until so near it (m, rad) or blocked."""
+        """Go to a way-point, turned by `turn` (rad) from the grasp's yaw, until so near it (m, rad) or blocked."""
         self._recent.clear()
-        aim = fingers_down(self._poses.grasp[3] + turn)
+        aim = fingers_down(self._yaw + turn)
         while not self._stands():
             away, error = point - self._position, rotation_vector(aim @ self._R.T)
             if np.linalg.norm(away) < near[0] and np.linalg.norm(error) < near[1]:
