@@ -143,7 +143,7 @@ class LearnedPolicy:
             actions = self._network.plan(batch, *rest)[0].numpy()
             width = float(actions[self.config.execution_horizon - 1, -1])
             if self._width not in (None, width):
-                self._key_pose.restart()
+                self._key_pose.go_on()
             self._width = width
             return actions
 

@@ -145,7 +145,7 @@ def test_the_average_of_a_moving_hand_steadies_and_follows_the_gripper() -> None
     off = []
     for tick, hand in enumerate(tcp[:, None]):
         if tick == 30:
-            average.restart()
+            average.go_on()
         stage = int(tick >= 32)  # for half a second the fingers move
         assert average.gripper_moves == (tick in (30, 31))
         true = F.pad(_columns(keys[None, stage : stage + 2]), (0, 1), value=1.0)

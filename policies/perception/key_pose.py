@@ -2,8 +2,8 @@
 
 With it comes whether the gripper is closed afterwards: without that, the end of a task looks like the
 place to grasp. The recordings hold both (keyframes: James and Davison 2022), and camera images show it. Taught it, a
-policy learns where things are; trained on the actions alone, it memorises the recordings. The one that
-follows is seen, too, before the hand with its load hides it.
+policy learns where things are; trained on the actions alone, it memorises the recordings. The key pose
+after it is predicted as well: later the hand and the object in it may hide that place.
 """
 
 import math
@@ -208,11 +208,10 @@ class KeyPoseReadout(nn.Module):
         No gradient goes through the estimate.
         """
         poses, expected, closed = self._estimates(maps, tcp, width)
-        off = poses - _in_hand_frame(tcp, _columns(key))[:, None]
-        off = off[..., :3].norm(dim=-1) / _POSITION, off[..., 3:].norm(dim=-1) / _ROTATION
-        errors = torch.stack(off, -1)
+        made = _errors(poses, tcp, key)
+        errors = torch.stack([made[..., :2].norm(dim=-1), made[..., 2]], -1)
         errors = torch.where(errors < _SMALL, errors.square() / 2 / _SMALL, errors - _SMALL / 2)
-        sureness = _errors(poses.detach(), tcp, key) * (-expected).exp() + expected
+        sureness = made.detach() * (-expected).exp() + expected
         after = F.binary_cross_entropy_with_logits(closed, key[:, None, :, 7].expand_as(closed))
         loss = errors.mean() + 0.1 * sureness.mean() + 0.1 * after
         return loss, _fused(poses, expected, closed)[:, 0].detach()
@@ -239,7 +238,7 @@ class KeyPoseReadout(nn.Module):
         And the logits of the gripper's being closed after them.
         """
         height, is_open = self.height_normalizer(tcp[:, 2:3]), (width >= self.open_width).float()
-        state = torch.cat([height, is_open], 1)  # not the width: a thing held otherwise has another
+        state = torch.cat([height, is_open], 1)  # the width itself depends on how an object is held
         poses, expected, closed = [], [], []
         for camera, (images, head) in enumerate(zip(self.images, self.heads, strict=True)):
             found = head(torch.cat([images(maps[:, camera]), state], 1)).unflatten(1, (_SEEN, -1))
@@ -266,14 +265,17 @@ class KeyPoseAverage:
         self._keep = math.exp(-plan_seconds / _MEMORY)
         self._hold = math.ceil(HOLD_SECONDS / plan_seconds)
         self._moving = 0  # estimates still to come while the fingers move
-        self._weight, self._mean = torch.zeros(_SEEN, 3), torch.zeros(1, _SEEN, _POSE + 1)
+        self._weight, self._mean = (
+            torch.zeros(_SEEN, len(_GROUPS)),
+            torch.zeros(1, _SEEN, _POSE + 1),
+        )
 
     @property
     def gripper_moves(self) -> bool:
         """Return whether the gripper was commanded to change within `HOLD_SECONDS`."""
         return self._moving > 0
 
-    def restart(self) -> None:
+    def go_on(self) -> None:
         """Go on to the key pose that follows, once the fingers have moved: the gripper changes."""
         self._moving = self._hold
 
@@ -287,12 +289,14 @@ class KeyPoseAverage:
         if not self.gripper_moves:
             before = self._weight * self._keep
             self._weight = before + weight[0]
-            share = (weight[0] / self._weight).repeat_interleave(torch.tensor([2, 1, 7]), 1)
+            share = (weight[0] / self._weight).repeat_interleave(
+                torch.tensor([*_GROUPS[:2], _GROUPS[2] + 1]), 1
+            )
             self._mean = torch.lerp(self._mean, _in_base_frame(tcp, pose), share)
         found = _in_hand_frame(tcp, self._mean)[:, 0]
         if self._moving == 1:
             self._mean = self._mean[:, [1, 1]]
-            self._weight = torch.stack([self._weight[1], torch.zeros(3)])
+            self._weight = torch.stack([self._weight[1], torch.zeros(len(_GROUPS))])
         self._moving = max(self._moving - 1, 0)
         return found
 

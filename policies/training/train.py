@@ -62,12 +62,12 @@ def train(
     def save_snapshot(history: list[dict[str, float]], provenance: dict[str, Any]) -> None:
         known = {"train": asdict(config), "windows": len(windows), "metrics": history[-1]}
         last = len(history) == config.epochs
-        if averaged.key_pose:
-            batch = _validation_batch(averaged, validation, config)
-            averaged.calibrate_sight(_observed(batch), batch["key_pose"])
         folders = [out_dir / POLICY] if last else []
         if last or len(history) % config.snapshot_epochs == 0:
             folders.append(out_dir / SNAPSHOTS / f"epoch-{len(history):04d}")
+        if folders and averaged.key_pose:
+            batch = _validation_batch(averaged, validation, config)
+            averaged.calibrate_sight(_observed(batch), batch["key_pose"])
         for folder in folders:
             on_first_process(partial(checkpoint.save, averaged, folder, provenance | known))
 
