@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.policies.network import PolicyConfig
-    from touchgoal.policies.perception.frozen_images import ImageInputConfig
     from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+    from touchgoal.policies.sight.frozen_images import ImageInputConfig
 
 ENVS: dict[TaskName, TaskConfig] = {"bead-maze": _ENVS["bead-maze"], **_ENVS}
 """Default options of each task's environment; `--help` shows the first one's."""
@@ -280,7 +280,7 @@ def _weights(
 
 def _image_input(config: Config, episodes: "EpisodeSet") -> "ImageInputConfig | None":
     from touchgoal.control import features as ft
-    from touchgoal.policies.perception.frozen_images import ImageInputConfig
+    from touchgoal.policies.sight.frozen_images import ImageInputConfig
     from touchgoal.runtime.errors import UserError
 
     if not config.cameras:

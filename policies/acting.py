@@ -16,11 +16,11 @@ from touchgoal.control.features import Observation
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.policies.network import NOVEL_SECONDS, ObservationBatch, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import difference_images
-from touchgoal.policies.perception.frozen_images import ImageEmbedder
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
-from touchgoal.policies.perception.key_pose import KeyPoseAverage
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.perception.state_estimation import StateEstimator
+from touchgoal.policies.sight.average import KeyPoseAverage
+from touchgoal.policies.sight.frozen_images import ImageEmbedder
 from touchgoal.runtime.errors import RefusedError, UserError
 from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskName
 from touchgoal.sim_envs.tasks import task_name

@@ -16,13 +16,13 @@ from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.network import PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
-from touchgoal.policies.perception.frozen_images import ImageInputConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
 from touchgoal.policies.perception.state_estimation import (
     StateEstimator,
     load_pose_estimator,
 )
+from touchgoal.policies.sight.frozen_images import ImageInputConfig
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.pick_place import PickPlace

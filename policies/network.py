@@ -26,9 +26,7 @@ from touchgoal.policies.heads.diffusion import (
 )
 from touchgoal.policies.heads.mlp import MLPConfig, readout
 from touchgoal.policies.heads.unet import UNetConfig
-from touchgoal.policies.perception import key_pose as kp
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
-from touchgoal.policies.perception.frozen_images import ImageInputConfig
 from touchgoal.policies.perception.novelty import NoveltyDetector
 from touchgoal.policies.perception.proprioception import (
     input_widths,
@@ -36,6 +34,11 @@ from touchgoal.policies.perception.proprioception import (
     is_position,
     network_input,
 )
+from touchgoal.policies.sight import key_pose as kp
+from touchgoal.policies.sight.average import KeyPoseAverage
+from touchgoal.policies.sight.estimates import likeliest
+from touchgoal.policies.sight.frozen_images import ImageInputConfig
+from touchgoal.policies.sight.readout import KeyPoseReadout
 from touchgoal.runtime.errors import UserError
 
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
@@ -164,7 +167,7 @@ class PolicyNetwork(nn.Module):
         if config.end_to_end:
             self.end_to_end_encoder = EndToEndEncoder(config.end_to_end)
             condition_dim += len(ft.TACTILE) * config.end_to_end.width
-        self.key_pose = kp.KeyPoseReadout(config.images) if config.images else None
+        self.key_pose = KeyPoseReadout(config.images) if config.images else None
         watches = config.watches_novelty and config.touch_dim > 0
         self.novelty = NoveltyDetector(config.touch_dim) if watches else None
         condition_dim += kp.KEY_POSE_DIM if self.key_pose else 0
@@ -229,15 +232,16 @@ class PolicyNetwork(nn.Module):
         pose, sight_loss = None, torch.zeros((), device=actions.device)
         if self.key_pose:
             assert batch.maps is not None and key_pose is not None, "needs maps and key poses"
-            sight_loss, pose = self.key_pose.loss(
-                batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose
-            )
+            hand = self._hand(batch.state[:, -1])
+            sight_loss = self.key_pose.loss(batch.maps.float(), *hand, key_pose)
+            pose = kp.true_pose(hand[0], key_pose)
             draws = 1 if self.end_to_end_encoder else _DRAWS
             rows = batch.touch, batch.state, batch.pictures, pose, actions, wrench, action_is_pad
             touch, state, pictures, pose, actions, wrench, action_is_pad = _repeated(rows, draws)
             batch = ObservationBatch(touch, state, pictures)
         chunk = to_representation(actions, batch.joints, self.config.representation)
         if pose is not None and self.config.representation == "body_twist":
+            pose, chunk = kp.face_any_way(pose, chunk, noise)
             pose, chunk = kp.set_beside(pose, chunk, noise)
         touch = self._encode_touch(batch, noise)
         wrench_loss = torch.zeros((), device=touch.device)
@@ -276,7 +280,7 @@ class PolicyNetwork(nn.Module):
         batch: ObservationBatch,
         generator: torch.Generator,
         width: float | None = None,
-        average: kp.KeyPoseAverage | None = None,
+        average: KeyPoseAverage | None = None,
     ) -> Float[Tensor, "b h 8"]:
         """Return actions (`features.ACTION`) of the ticks from the latest observation on.
 
@@ -298,15 +302,17 @@ class PolicyNetwork(nn.Module):
         return actions
 
     def _see(
-        self, batch: ObservationBatch, average: kp.KeyPoseAverage | None
+        self, batch: ObservationBatch, average: KeyPoseAverage | None
     ) -> Float[Tensor, "b 10"] | None:
         """Return the next key pose in the hand's frame, as the cameras show it."""
         if not self.key_pose:
             return None
         assert batch.maps is not None, "needs the cameras' feature maps"
         tcp, width = self._hand(batch.state[:, -1])
-        pose, weight = self.key_pose(batch.maps.float(), tcp, width)
-        return average.add(pose, weight, tcp) if average else pose[:, 0]
+        seen, weight = self.key_pose(batch.maps.float(), tcp, width)
+        if average:
+            return average.add(seen, weight, tcp)
+        return torch.cat([likeliest(seen[:, 0, :-1]), (seen[:, 0, -1:] > 0.5).float()], 1)
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None

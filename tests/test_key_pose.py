@@ -1,4 +1,4 @@
-"""The next key pose: its labels, its frame, places never recorded, and when the gripper may change."""
+"""The next key pose: its labels, its frames, places never recorded, and when the gripper may change."""
 
 from collections.abc import Sequence
 
@@ -11,16 +11,11 @@ from scipy.spatial.transform import Rotation
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
-from touchgoal.policies.perception.frozen_images import ImageInputConfig
-from touchgoal.policies.perception.key_pose import (
-    KeyPoseAverage,
-    KeyPoseReadout,
-    _columns,
-    _errors,
-    _in_hand_frame,
-    next_key_poses,
-    set_beside,
-)
+from touchgoal.policies.sight.average import KeyPoseAverage
+from touchgoal.policies.sight.estimates import FIXED, GROUPS, estimate_from, likeliest, seen_from
+from touchgoal.policies.sight.frozen_images import ImageInputConfig
+from touchgoal.policies.sight.key_pose import face_any_way, next_key_poses, set_beside, true_pose
+from touchgoal.policies.sight.readout import KeyPoseReadout, errors
 
 
 @pytest.mark.parametrize(
@@ -112,31 +107,66 @@ def test_a_camera_finds_a_thing_at_places_never_seen(camera: str) -> None:
     for step in range(200):
         rows = torch.from_numpy(np.random.default_rng(step).choice(512, 64, replace=False))
         optimizer.zero_grad()
-        loss, _ = readout.loss(maps[rows].float(), tcp[rows], width[rows], key[rows])
+        loss = readout.loss(maps[rows].float(), tcp[rows], width[rows], key[rows])
         loss.backward()
         optimizer.step()
     off = readout.error(maps[512:].float(), tcp[512:], width[512:], key[512:])
     assert (off.median(0).values < 0.025).all()  # where guessing the mean place is 0.1 m off
-    closes = readout(maps[512:].float(), tcp[512:], width[512:])[0][:, 0, 9] > 0.5
+    closes = readout(maps[512:].float(), tcp[512:], width[512:])[0][:, 0, 10] > 0.5
     if camera == ft.FRONT:  # the hand's camera does not know where the left side is
         assert (closes == key[512:, 0, 7].bool()).float().mean() > 0.9
     readout.calibration += 1.0
     rows = maps[512:].float(), tcp[512:], width[512:]
     readout.calibrate(*rows, key[512:])
-    _, expected, _ = readout._estimates(*rows)
-    made = _errors(readout._estimates(*rows)[0], tcp[512:], key[512:])
-    torch.testing.assert_close((made / expected.exp()).mean(0), torch.ones(1, 2, 3))
+    estimates, expected, _ = readout.estimates(*rows)
+    made = errors(estimates, readout._true(tcp[512:], key[512:]))
+    wanted = torch.ones(1, 2, len(GROUPS))
+    torch.testing.assert_close((made / expected.exp()).mean(0), wanted, atol=1e-3, rtol=0)
 
 
-def test_poses_turn_into_the_hands_frame_as_scipy_turns_them() -> None:
+def _half_a_turn_on(poses: torch.Tensor, share: float = 1.0) -> torch.Tensor:
+    turn = Rotation.from_rotvec([0, 0, np.pi * share])
+    R = Rotation.from_quat(poses[:, 3:].numpy(), scalar_first=True) * turn
+    turned = torch.from_numpy(R.as_quat(scalar_first=True)).float()
+    return torch.cat([poses[:, :3], turned], 1)
+
+
+def test_estimates_turn_into_the_hands_frame_as_scipy_turns_them() -> None:
     rng = np.random.default_rng(2)
     tcp, key = _poses(rng, 20), _poses(rng, 20)
-    found = _in_hand_frame(tcp, _columns(F.pad(key, (0, 1))[:, None]))[:, 0].numpy()
-    R = Rotation.from_quat(tcp[:, 3:].numpy(), scalar_first=True)
-    np.testing.assert_allclose(found[:, :3], R.inv().apply((key - tcp)[:, :3].numpy()), atol=1e-5)
-    turned = (R.inv() * Rotation.from_quat(key[:, 3:].numpy(), scalar_first=True)).as_matrix()
-    np.testing.assert_allclose(found[:, 3:6], turned[:, :, 0], atol=1e-5)
-    np.testing.assert_allclose(found[:, 6:], turned[:, :, 1], atol=1e-5)
+    tilt = Rotation.from_rotvec(rng.normal(0, 0.3, (20, 3)))
+    R = tilt * Rotation.from_quat(key[:, 3:].numpy(), scalar_first=True)
+    key[:, 3:] = torch.from_numpy(R.as_quat(scalar_first=True))
+    hand = Rotation.from_quat(tcp[:, 3:].numpy(), scalar_first=True)
+    turned = (hand.inv() * R).as_matrix()
+    estimate = estimate_from(tcp, key)
+    found = likeliest(estimate)
+    place = hand.inv().apply((key - tcp)[:, :3].numpy())
+    np.testing.assert_allclose(found[:, :3], place, atol=1e-5)
+    near = np.sign(
+        (found.numpy()[:, 3:6] * turned[:, :, 0]).sum(1, keepdims=True)
+    )  # or half a turn on
+    np.testing.assert_allclose(near * found.numpy()[:, 3:6], turned[:, :, 0], atol=0.02)  # a degree
+    np.testing.assert_allclose(near * found.numpy()[:, 6:], turned[:, :, 1], atol=0.02)
+    np.testing.assert_allclose(estimate[:, 3:6], turned[:, :, 2], atol=1e-5)
+    torch.testing.assert_close(estimate_from(tcp, _half_a_turn_on(key)), estimate)
+    fixed = torch.tensor([FIXED]).expand(20, 7)
+    there = seen_from(fixed, estimate, tcp)
+    torch.testing.assert_close(there, estimate_from(fixed, key))
+    torch.testing.assert_close(seen_from(tcp, there, fixed), estimate)
+
+
+@pytest.mark.parametrize("first", [0.5, 0.51])
+def test_between_two_ways_to_grasp_a_box_the_mean_is_one_of_them(first: float) -> None:
+    rng = np.random.default_rng(4)
+    tcp, key = _poses(rng, 20), _poses(rng, 20)
+    ways = [estimate_from(tcp, way) for way in (key, _half_a_turn_on(key, 0.5))]
+    found = likeliest(first * ways[0] + (1 - first) * ways[1])
+    alike = [(likeliest(way)[:, 3:] - found[:, 3:]).norm(dim=1) < 0.1 for way in ways]
+    assert (alike[0] | alike[1]).all()
+    turn = torch.atan2(found[:, 4], found[:, 3]).abs()
+    if first == 0.5:
+        assert (turn < np.pi / 4 + 0.1).all()  # the nearer one
 
 
 def test_the_average_of_a_moving_hand_steadies_and_follows_the_gripper() -> None:
@@ -148,13 +178,15 @@ def test_the_average_of_a_moving_hand_steadies_and_follows_the_gripper() -> None
             average.go_on()
         stage = int(tick >= 32)  # for half a second the fingers move
         assert average.gripper_moves == (tick in (30, 31))
-        true = F.pad(_columns(keys[None, stage : stage + 2]), (0, 1), value=1.0)
-        true = _in_hand_frame(hand, true)
+        true = torch.cat([estimate_from(hand, key[None, :7]) for key in keys[stage : stage + 2]])
+        true = F.pad(true, (0, 1), value=1.0)[None]
         hidden = tick % 3 == 2  # and the estimate says so
-        noise = torch.from_numpy(rng.normal(0, 0.1 if hidden else 0.01, (1, 2, 10))).float()
-        weight = torch.full((1, 2, 3), 1.0 if hidden else 100.0)
+        noise = torch.from_numpy(rng.normal(0, 0.1 if hidden else 0.01, (1, 2, 11))).float()
+        weight = torch.full((1, 2, len(GROUPS)), 1.0 if hidden else 100.0)
         found = average.add(true + noise, weight, hand)
-        off.append(((found - true[:, 0])[0, :3].norm() / noise[0, 0, :3].norm()).item())
+        off.append(((found[:, :3] - true[:, 0, :3]).norm() / noise[0, 0, :3].norm()).item())
+        both = F.pad(keys[stage, :7][None, None].expand(1, 2, 7), (0, 1), value=1.0)
+        assert (found - true_pose(hand, both))[0, 3:].abs().max() < (0.6 if tick == 0 else 0.2)
     assert off[0] == pytest.approx(1, abs=1e-3)
     assert max(off[30:33]) < 1  # what followed has been seen all along
     assert np.median(off[10:]) < 0.6
@@ -164,7 +196,7 @@ def test_the_average_of_a_moving_hand_steadies_and_follows_the_gripper() -> None
 def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:
     generator, n, h = torch.Generator().manual_seed(1), 64, 12
     rotation = torch.eye(3)[:2].flatten().expand(n, 6)
-    poses = torch.cat([torch.randn(n, 3, generator=generator) / 10, rotation, torch.ones(n, 1)], 1)
+    poses = torch.cat([torch.randn(n, 3, generator=generator) / 50, rotation, torch.ones(n, 1)], 1)
     plans = torch.zeros(n, h, 8)
     plans[..., :3] = torch.linspace(0, 0.05, h)[:, None]
     plans[: n // 2, h // 2 :, -1] = 0.08  # the gripper opens
@@ -182,6 +214,26 @@ def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:
     assert (there[:, 9] == 1).all()
 
 
+def test_turned_plans_go_to_the_turned_key_pose() -> None:
+    rng = np.random.default_rng(5)
+    tcp, key = _poses(rng, 20), F.pad(_poses(rng, 20), (0, 1))
+    poses = true_pose(tcp, torch.stack([key, key], 1))
+    turn = torch.from_numpy(rng.normal(0, 0.3, (20, 1, 3))).float()
+    plans = torch.cat([poses[:, None, :3], turn, torch.zeros(20, 1, 2)], 2)
+    there, led = face_any_way(poses, plans, BatchNoise(torch.Generator().manual_seed(0)))
+    torch.testing.assert_close(led[:, 0, :3], there[:, :3])
+    torch.testing.assert_close(there[:, :3].norm(dim=1), poses[:, :3].norm(dim=1))
+    assert ((there - poses)[:, :2].norm(dim=1) > 0.01).any()
+    # the hand's turn, followed by what is left, is the turn of the key pose, as seen before
+    about = np.arctan2(there[:, 1], there[:, 0]) - np.arctan2(poses[:, 1], poses[:, 0])
+    A = Rotation.from_euler("z", about[:, None].numpy())
+    seen = (A * Rotation.from_rotvec(turn[:, 0].numpy()) * A.inv()).as_rotvec()
+    np.testing.assert_allclose(led[:, 0, 3:6], seen, atol=1e-5)
+    columns = [poses[:, 3:6], poses[:, 6:9], torch.linalg.cross(poses[:, 3:6], poses[:, 6:9])]
+    M = (A * Rotation.from_matrix(torch.stack(columns, 2).numpy()) * A.inv()).as_matrix()
+    np.testing.assert_allclose(there[:, 3:9], M[:, :, :2].swapaxes(1, 2).reshape(-1, 6), atol=1e-5)
+
+
 def test_the_gripper_changes_where_the_hand_rests_at_a_key_pose_and_no_velocity_is_read() -> None:
     images = ImageInputConfig((ft.WRIST,), (96, 96))
     torch.manual_seed(0)
@@ -196,19 +248,21 @@ def test_the_gripper_changes_where_the_hand_rests_at_a_key_pose_and_no_velocity_
         return network.plan(batch, torch.Generator().manual_seed(0), width)[..., -1]
 
     assert network.key_pose
-    *_, last = network.key_pose.heads[0].children()
-    assert isinstance(last, torch.nn.Linear)
-    torch.nn.init.zeros_(last.weight)
-    torch.nn.init.zeros_(last.bias)  # at the key pose
+    (camera,) = network.key_pose.cameras
+    last, turns = camera.places[-1], camera.turns[-1]
+    for layer in (last, turns):
+        torch.nn.init.zeros_(layer.weight)
+        torch.nn.init.zeros_(layer.bias)  # at the key pose
+    turns.bias.data[[2, 3]] = 1.0
     for sees_closed, width in ((5.0, 0.0), (-5.0, 0.08)):
-        last.bias.data[12] = sees_closed
+        last.bias.data[5] = sees_closed
         assert (widths(0.0) == width).all() and (widths(0.08) == width).all()
     state[:, 0, 17] += 0.002  # moving on
     assert (widths(0.0) == 0).all() and (widths(0.08) == 0.08).all()
     state[:, 0, 17] -= 0.002
-    last.bias.data[2] = 0.3  # 15 mm away: the head decides
+    last.bias.data[2] = 0.015  # 15 mm away: the head decides
     assert torch.equal(widths(0.0), widths(None)) and torch.equal(widths(0.08), widths(None))
-    last.bias.data[2] = 2.0  # 10 cm away
+    last.bias.data[2] = 0.1  # 10 cm away
     assert (widths(0.0) == 0).all() and (widths(0.08) == 0.08).all()
     before = network.plan(batch, torch.Generator().manual_seed(0))
     state[..., 7:14] = 1.0

@@ -27,7 +27,7 @@ from touchgoal.policies.evaluation.report import film_trials
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.evaluation.table import table
 from touchgoal.policies.heads.diffusion import DiffusionConfig
-from touchgoal.policies.perception.frozen_images import ImageEmbedder, ImageInputConfig
+from touchgoal.policies.sight.frozen_images import ImageEmbedder, ImageInputConfig
 from touchgoal.policies.training.training_data import choose_episodes, common_sensor, find_task
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig

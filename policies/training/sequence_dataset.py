@@ -14,10 +14,10 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
-from touchgoal.policies.perception.frozen_images import ImageEmbedder
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
-from touchgoal.policies.perception.key_pose import HOLD_SECONDS, next_key_poses
 from touchgoal.policies.perception.proprioception import tare
+from touchgoal.policies.sight.frozen_images import ImageEmbedder
+from touchgoal.policies.sight.key_pose import HOLD_SECONDS, next_key_poses
 from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import Workers

@@ -1,0 +1,64 @@
+"""Average of what is seen in an episode."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from touchgoal.policies.sight.estimates import ESTIMATE_DIM, FIXED, GROUPS, likeliest, seen_from
+from touchgoal.policies.sight.key_pose import HOLD_SECONDS
+from touchgoal.policies.sight.readout import SEEN, repeated
+
+_MEMORY = 1.0  # s after which an estimate weighs 1/e in the average
+
+
+class KeyPoseAverage:
+    """Average of an episode's estimates: over its goal the hand hides it from the cameras.
+
+    Made in the base's frame. Once the gripper has changed, the key pose that followed is the next.
+    """
+
+    def __init__(self, plan_seconds: float) -> None:
+        """Begin an episode with an estimate every `plan_seconds`."""
+        self._keep = math.exp(-plan_seconds / _MEMORY)
+        self._hold = math.ceil(HOLD_SECONDS / plan_seconds)
+        self._moving = 0  # estimates still to come while the fingers move
+        self._weight, self._mean = (
+            torch.zeros(SEEN, len(GROUPS)),
+            torch.zeros(SEEN, ESTIMATE_DIM + 1),
+        )
+
+    @property
+    def gripper_moves(self) -> bool:
+        """Return whether the gripper was commanded to change within `HOLD_SECONDS`."""
+        return self._moving > 0
+
+    def go_on(self) -> None:
+        """Go on to the key pose that follows, once the fingers have moved: the gripper changes."""
+        self._moving = self._hold
+
+    def add(
+        self,
+        estimate: Float[Tensor, "1 2 11"],
+        weight: Float[Tensor, "1 2 5"],
+        tcp: Float[Tensor, "1 7"],
+    ) -> Float[Tensor, "1 10"]:
+        """Add estimates seen from the hand with their weights; return the next key pose in its frame.
+
+        It is given as by `true_pose`.
+        """
+        fixed, hand = torch.tensor([FIXED]).expand(SEEN, 7), tcp.expand(SEEN, 7)
+        if not self.gripper_moves:
+            seen = seen_from(fixed, estimate[0, :, :-1], hand)
+            seen = torch.cat([seen, estimate[0, :, -1:]], 1)
+            self._weight = self._weight * self._keep + weight[0]
+            share = repeated(weight[0] / self._weight)
+            self._mean = torch.lerp(self._mean, seen, torch.cat([share, share[:, :1]], 1))
+        found = seen_from(hand[:1], self._mean[:1, :-1], fixed[:1])
+        closes = (self._mean[:1, -1:] > 0.5).float()
+        if self._moving == 1:
+            self._mean = self._mean[[1, 1]]
+            self._weight = torch.stack([self._weight[1], torch.zeros(len(GROUPS))])
+        self._moving = max(self._moving - 1, 0)
+        return torch.cat([likeliest(found), closes], 1)
