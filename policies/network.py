@@ -36,7 +36,6 @@ from touchgoal.policies.perception.proprioception import (
 )
 from touchgoal.policies.sight import key_pose as kp
 from touchgoal.policies.sight.average import KeyPoseAverage
-from touchgoal.policies.sight.estimates import likeliest
 from touchgoal.policies.sight.frozen_images import ImageInputConfig
 from touchgoal.policies.sight.readout import KeyPoseReadout
 from touchgoal.runtime.errors import UserError
@@ -186,7 +185,7 @@ class PolicyNetwork(nn.Module):
         wrench: Float[Tensor, "n 12"] | None = None,
         action_is_pad: Bool[Tensor, "m h"] | None = None,
         maps: Float16[Tensor, "n k c y x"] | None = None,
-        key_pose: Float[Tensor, "n 2 8"] | None = None,
+        key_pose: Float[Tensor, "n 3 8"] | None = None,
     ) -> None:
         """Fit the normalizers to training data: n ticks, and the chunks of m windows.
 
@@ -199,7 +198,7 @@ class PolicyNetwork(nn.Module):
             self.wrench_normalizer.fit_mean_std(wrench)
         if self.key_pose:
             assert maps is not None and key_pose is not None, "needs maps and key poses"
-            self.key_pose.fit(maps, *self._hand(state), key_pose)
+            self.key_pose.fit(maps, *self._hand(state), key_pose[:, 1:])
         columns, kind = self.config.proprioception, self.config.representation
         self.state_normalizer.fit_mean_std(network_input(state, columns, kind))
         valid = None if action_is_pad is None else ~action_is_pad[..., None]
@@ -223,7 +222,7 @@ class PolicyNetwork(nn.Module):
         noise: BatchNoise,
         wrench: Float[Tensor, "b o 12"] | None = None,
         action_is_pad: Bool[Tensor, "b h"] | None = None,
-        key_pose: Float[Tensor, "b 2 8"] | None = None,
+        key_pose: Float[Tensor, "b 3 8"] | None = None,
     ) -> Float[Tensor, ""]:
         """Return the training loss on windows, without ticks after the episode's end.
 
@@ -233,7 +232,7 @@ class PolicyNetwork(nn.Module):
         if self.key_pose:
             assert batch.maps is not None and key_pose is not None, "needs maps and key poses"
             hand = self._hand(batch.state[:, -1])
-            sight_loss = self.key_pose.loss(batch.maps.float(), *hand, key_pose)
+            sight_loss = self.key_pose.loss(batch.maps.float(), *hand, key_pose[:, 1:])
             pose = kp.true_pose(hand[0], key_pose)
             draws = 1 if self.end_to_end_encoder else _DRAWS
             rows = batch.touch, batch.state, batch.pictures, pose, actions, wrench, action_is_pad
@@ -255,16 +254,18 @@ class PolicyNetwork(nn.Module):
 
     @torch.no_grad()
     def key_pose_error(
-        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 2 8"]
+        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]
     ) -> Float[Tensor, "b 2"]:
         """Return how far off sight sees the next key pose and the one after it, m."""
         assert self.key_pose and batch.maps is not None, "needs cameras"
-        return self.key_pose.error(batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose)
+        hand = self._hand(batch.state[:, -1])
+        return self.key_pose.error(batch.maps.float(), *hand, key_pose[:, 1:])
 
-    def calibrate_sight(self, batch: ObservationBatch, key_pose: Float[Tensor, "b 2 8"]) -> None:
+    def calibrate_sight(self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]) -> None:
         """Scale the errors that the cameras expect to those on episodes that were not trained on."""
         assert self.key_pose and batch.maps is not None, "needs cameras"
-        self.key_pose.calibrate(batch.maps.float(), *self._hand(batch.state[:, -1]), key_pose)
+        hand = self._hand(batch.state[:, -1])
+        self.key_pose.calibrate(batch.maps.float(), *hand, key_pose[:, 1:])
 
     def _hand(
         self, state: Float[Tensor, "b s"]
@@ -281,15 +282,20 @@ class PolicyNetwork(nn.Module):
         generator: torch.Generator,
         width: float | None = None,
         average: KeyPoseAverage | None = None,
+        key_pose: Float[Tensor, "b 3 8"] | None = None,
     ) -> Float[Tensor, "b h 8"]:
         """Return actions (`features.ACTION`) of the ticks from the latest observation on.
 
         The same generator state (on the CPU) gives the same plan. `width` is the last plan's, m: with
-        cameras the gripper keeps it until the hand is at the next key pose. `average` is that of the
-        key poses seen in the episode; without it only the latest images count.
+        cameras the gripper keeps it until the hand is at the next key pose. Then it needs the `average` of
+        what was seen in the episode, or the true key poses.
         """
-        keeps = average is not None and average.gripper_moves
-        pose = self._see(batch, average)
+        keeps, pose = average is not None and average.gripper_moves, None
+        if self.key_pose and key_pose is not None:
+            pose = kp.true_pose(self._hand(batch.state[:, -1])[0], key_pose)
+        elif self.key_pose:
+            assert average is not None, "needs what was seen in the episode, or the true key poses"
+            pose = self._see(batch, average)
         encoded = self._encode(batch, self._encode_touch(batch), pose)
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)
@@ -301,18 +307,11 @@ class PolicyNetwork(nn.Module):
                 actions[..., -1] = width if keeps else seen
         return actions
 
-    def _see(
-        self, batch: ObservationBatch, average: KeyPoseAverage | None
-    ) -> Float[Tensor, "b 10"] | None:
-        """Return the next key pose in the hand's frame, as the cameras show it."""
-        if not self.key_pose:
-            return None
-        assert batch.maps is not None, "needs the cameras' feature maps"
+    def _see(self, batch: ObservationBatch, average: KeyPoseAverage) -> Float[Tensor, "b 14"]:
+        """Return the key poses in the hand's frame, as the cameras have shown them."""
+        assert self.key_pose and batch.maps is not None, "needs the cameras' feature maps"
         tcp, width = self._hand(batch.state[:, -1])
-        seen, weight = self.key_pose(batch.maps.float(), tcp, width)
-        if average:
-            return average.add(seen, weight, tcp)
-        return torch.cat([likeliest(seen[:, 0, :-1]), (seen[:, 0, -1:] > 0.5).float()], 1)
+        return average.add(*self.key_pose(batch.maps.float(), tcp, width), tcp)
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None
@@ -330,7 +329,7 @@ class PolicyNetwork(nn.Module):
         self,
         batch: ObservationBatch,
         touch: Float[Tensor, "b o w"],
-        pose: Float[Tensor, "b 10"] | None,
+        pose: Float[Tensor, "b 14"] | None,
         noise: BatchNoise | None = None,
     ) -> Float[Tensor, "b c"]:
         """Return the head's whole input, with the training's noise if given."""

@@ -14,12 +14,12 @@ from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNet
 from touchgoal.policies.sight.average import KeyPoseAverage
 from touchgoal.policies.sight.estimates import FIXED, GROUPS, estimate_from, likeliest, seen_from
 from touchgoal.policies.sight.frozen_images import ImageInputConfig
-from touchgoal.policies.sight.key_pose import face_any_way, next_key_poses, set_beside, true_pose
+from touchgoal.policies.sight.key_pose import face_any_way, key_poses, set_beside, true_pose
 from touchgoal.policies.sight.readout import KeyPoseReadout, errors
 
 
 @pytest.mark.parametrize(
-    ("widths", "lengths", "hold", "keys", "following", "closed"),
+    ("widths", "lengths", "hold", "keys", "following", "closed", "left"),
     [
         (
             [0.08, 0.08, 0.0, 0.0, 0.0, 0.08, 0.08],
@@ -28,6 +28,7 @@ from touchgoal.policies.sight.readout import KeyPoseReadout, errors
             [1, 1, 4, 4, 4, 4, 4],
             [4] * 7,
             "1100000",
+            [None, None, 1, 1, 1, 4, 4],
         ),
         (
             [0.08, 0.0, 0.0, 0.08, 0.0, 0.0],
@@ -36,6 +37,7 @@ from touchgoal.policies.sight.readout import KeyPoseReadout, errors
             [0, 2, 2, 3, 5, 5],
             [2, 2, 2, 5, 5, 5],
             "111111",
+            [None, 0, 0, None, 3, 3],
         ),
         (
             [0.08, 0.0, 0.0, 0.0, 0.0, 0.08],
@@ -44,6 +46,7 @@ from touchgoal.policies.sight.readout import KeyPoseReadout, errors
             [0, 0, 0, 3, 4, 4],
             [3, 3, 3, 3, 4, 4],
             "111100",
+            [None, None, None, 0, None, None],
         ),
         (
             [0.05, 0.0501, 0.05, 0.0502],
@@ -52,6 +55,7 @@ from touchgoal.policies.sight.readout import KeyPoseReadout, errors
             [1, 1, 3, 3],
             [1, 1, 3, 3],
             "0000",
+            [None] * 4,
         ),  # noise on one width
     ],
 )
@@ -62,9 +66,14 @@ def test_a_key_pose_is_where_the_gripper_changes_or_the_episode_ends(
     keys: list[int],
     following: list[int],
     closed: str,
+    left: list[int | None],
 ) -> None:
     tcp = np.random.default_rng(0).normal(size=(len(widths), 7)).astype(np.float32)
-    found, then = next_key_poses(tcp, np.array(widths, np.float32), lengths, hold).swapaxes(0, 1)
+    poses = key_poses(tcp, np.array(widths, np.float32), lengths, hold)
+    before, found, then = poses.swapaxes(0, 1)
+    assert before[:, 7].astype(bool).tolist() == [n is not None for n in left]
+    own = [tick if n is None else n for tick, n in enumerate(left)]
+    np.testing.assert_array_equal(before[:, :7], tcp[own])
     np.testing.assert_array_equal(found[:, :7], tcp[keys])
     assert "".join(f"{after:.0f}" for after in found[:, 7]) == closed
     np.testing.assert_array_equal(then[:, :7], tcp[following])
@@ -185,8 +194,11 @@ def test_the_average_of_a_moving_hand_steadies_and_follows_the_gripper() -> None
         weight = torch.full((1, 2, len(GROUPS)), 1.0 if hidden else 100.0)
         found = average.add(true + noise, weight, hand)
         off.append(((found[:, :3] - true[:, 0, :3]).norm() / noise[0, 0, :3].norm()).item())
-        both = F.pad(keys[stage, :7][None, None].expand(1, 2, 7), (0, 1), value=1.0)
-        assert (found - true_pose(hand, both))[0, 3:].abs().max() < (0.6 if tick == 0 else 0.2)
+        known = F.pad(keys[[stage], :7], (0, 1), value=1.0)
+        left = torch.cat([tcp[[29 if stage else tick]], torch.full((1, 1), float(stage))], 1)
+        wanted = true_pose(hand, torch.stack([left, known, known], 1))
+        assert (found - wanted)[0, 3:].abs().max() < (0.6 if tick == 0 else 0.2)
+        torch.testing.assert_close(found[:, 10:], wanted[:, 10:])
     assert off[0] == pytest.approx(1, abs=1e-3)
     assert max(off[30:33]) < 1  # what followed has been seen all along
     assert np.median(off[10:]) < 0.6
@@ -196,7 +208,9 @@ def test_the_average_of_a_moving_hand_steadies_and_follows_the_gripper() -> None
 def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:
     generator, n, h = torch.Generator().manual_seed(1), 64, 12
     rotation = torch.eye(3)[:2].flatten().expand(n, 6)
-    poses = torch.cat([torch.randn(n, 3, generator=generator) / 50, rotation, torch.ones(n, 1)], 1)
+    place, left = torch.randn(2, n, 3, generator=generator) / 50
+    one = torch.ones(n, 1)
+    poses = torch.cat([place, rotation, one, left, one], 1)
     plans = torch.zeros(n, h, 8)
     plans[..., :3] = torch.linspace(0, 0.05, h)[:, None]
     plans[: n // 2, h // 2 :, -1] = 0.08  # the gripper opens
@@ -210,6 +224,8 @@ def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:
     )  # from the hand beside to the recorded one
     left = (poses[:, :3] - plans[:, -1, :3]).numpy()
     np.testing.assert_allclose(there[:, :3] - back[:, -1, :3], turn.apply(left), atol=1e-6)
+    gone = (poses[:, 10:13] - plans[:, -1, :3]).numpy()
+    np.testing.assert_allclose(there[:, 10:13] - back[:, -1, :3], turn.apply(gone), atol=1e-6)
     np.testing.assert_allclose(there[:, 3:6], turn.apply(poses[:, 3:6].numpy()), atol=1e-6)
     assert (there[:, 9] == 1).all()
 
@@ -217,15 +233,17 @@ def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:
 def test_turned_plans_go_to_the_turned_key_pose() -> None:
     rng = np.random.default_rng(5)
     tcp, key = _poses(rng, 20), F.pad(_poses(rng, 20), (0, 1))
-    poses = true_pose(tcp, torch.stack([key, key], 1))
+    poses = true_pose(tcp, torch.stack([key + 0.1, key, key], 1))
     turn = torch.from_numpy(rng.normal(0, 0.3, (20, 1, 3))).float()
     plans = torch.cat([poses[:, None, :3], turn, torch.zeros(20, 1, 2)], 2)
     there, led = face_any_way(poses, plans, BatchNoise(torch.Generator().manual_seed(0)))
     torch.testing.assert_close(led[:, 0, :3], there[:, :3])
     torch.testing.assert_close(there[:, :3].norm(dim=1), poses[:, :3].norm(dim=1))
+    away = [(p[:, 10:13] - p[:, :3]).norm(dim=1) for p in (there, poses)]
+    torch.testing.assert_close(*away)
     assert ((there - poses)[:, :2].norm(dim=1) > 0.01).any()
     # the hand's turn, followed by what is left, is the turn of the key pose, as seen before
-    about = np.arctan2(there[:, 1], there[:, 0]) - np.arctan2(poses[:, 1], poses[:, 0])
+    about = torch.atan2(there[:, 1], there[:, 0]) - torch.atan2(poses[:, 1], poses[:, 0])
     A = Rotation.from_euler("z", about[:, None].numpy())
     seen = (A * Rotation.from_rotvec(turn[:, 0].numpy()) * A.inv()).as_rotvec()
     np.testing.assert_allclose(led[:, 0, 3:6], seen, atol=1e-5)
@@ -240,12 +258,16 @@ def test_the_gripper_changes_where_the_hand_rests_at_a_key_pose_and_no_velocity_
     network = PolicyNetwork(
         PolicyConfig(0, "", images=images, gripper_widths=(0.0, 0.08), representation="body_twist")
     ).eval()
-    state = torch.randn(4, 2, 22) / 10
-    state[..., 15:] = _poses(np.random.default_rng(0), 4)[:, None]  # at rest
-    batch = ObservationBatch(torch.empty(4, 2, 0), state, maps=torch.randn(4, 1, 40, 12, 12).half())
+    state = torch.randn(1, 2, 22) / 10
+    state[..., 15:] = _poses(np.random.default_rng(0), 1)[:, None]  # at rest
+    batch = ObservationBatch(torch.empty(1, 2, 0), state, maps=torch.randn(1, 1, 40, 12, 12).half())
+
+    def plan(width: float | None) -> torch.Tensor:
+        generator = torch.Generator().manual_seed(0)
+        return network.plan(batch, generator, width, KeyPoseAverage(0.3))
 
     def widths(width: float | None) -> torch.Tensor:
-        return network.plan(batch, torch.Generator().manual_seed(0), width)[..., -1]
+        return plan(width)[..., -1]
 
     assert network.key_pose
     (camera,) = network.key_pose.cameras
@@ -264,6 +286,6 @@ def test_the_gripper_changes_where_the_hand_rests_at_a_key_pose_and_no_velocity_
     assert torch.equal(widths(0.0), widths(None)) and torch.equal(widths(0.08), widths(None))
     last.bias.data[2] = 0.1  # 10 cm away
     assert (widths(0.0) == 0).all() and (widths(0.08) == 0.08).all()
-    before = network.plan(batch, torch.Generator().manual_seed(0))
+    before = plan(None)
     state[..., 7:14] = 1.0
-    torch.testing.assert_close(network.plan(batch, torch.Generator().manual_seed(0)), before)
+    torch.testing.assert_close(plan(None), before)

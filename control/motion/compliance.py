@@ -8,7 +8,7 @@ from touchgoal.control.features import Observation
 
 # N and Nm beyond the first reading that count as none: the weight of a carried object, and the drift
 # of an arm's own estimate.
-_FREE_FORCE, _FREE_TORQUE = 3.0, 0.3
+_FREE_FORCE, _FREE_TORQUE = 3.0, 0.6
 
 
 class Compliance:

@@ -6,7 +6,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from touchgoal.policies.sight.estimates import ESTIMATE_DIM, FIXED, GROUPS, likeliest, seen_from
+from touchgoal.policies.sight.estimates import (
+    ESTIMATE_DIM,
+    FIXED,
+    GROUPS,
+    estimate_from,
+    likeliest,
+    seen_from,
+)
 from touchgoal.policies.sight.key_pose import HOLD_SECONDS
 from touchgoal.policies.sight.readout import SEEN, repeated
 
@@ -24,6 +31,9 @@ class KeyPoseAverage:
         self._keep = math.exp(-plan_seconds / _MEMORY)
         self._hold = math.ceil(HOLD_SECONDS / plan_seconds)
         self._moving = 0  # estimates still to come while the fingers move
+        self._tcp: Float[Tensor, "1 7"] | None = None  # at the latest estimate
+        self._changed: Float[Tensor, "1 7"] | None = None  # where the gripper last changed
+        self._left: Float[Tensor, "1 7"] | None = None  # the same, once the fingers have moved
         self._weight, self._mean = (
             torch.zeros(SEEN, len(GROUPS)),
             torch.zeros(SEEN, ESTIMATE_DIM + 1),
@@ -36,18 +46,15 @@ class KeyPoseAverage:
 
     def go_on(self) -> None:
         """Go on to the key pose that follows, once the fingers have moved: the gripper changes."""
-        self._moving = self._hold
+        self._moving, self._changed = self._hold, self._tcp
 
     def add(
         self,
         estimate: Float[Tensor, "1 2 11"],
         weight: Float[Tensor, "1 2 5"],
         tcp: Float[Tensor, "1 7"],
-    ) -> Float[Tensor, "1 10"]:
-        """Add estimates seen from the hand with their weights; return the next key pose in its frame.
-
-        It is given as by `true_pose`.
-        """
+    ) -> Float[Tensor, "1 14"]:
+        """Add estimates seen from the hand with their weights; return what is known, as by `true_pose`."""
         fixed, hand = torch.tensor([FIXED]).expand(SEEN, 7), tcp.expand(SEEN, 7)
         if not self.gripper_moves:
             seen = seen_from(fixed, estimate[0, :, :-1], hand)
@@ -57,8 +64,11 @@ class KeyPoseAverage:
             self._mean = torch.lerp(self._mean, seen, torch.cat([share, share[:, :1]], 1))
         found = seen_from(hand[:1], self._mean[:1, :-1], fixed[:1])
         closes = (self._mean[:1, -1:] > 0.5).float()
+        left = torch.zeros(1, 4)
+        if self._left is not None:
+            left = torch.cat([estimate_from(tcp, self._left)[:, :3], torch.ones(1, 1)], 1)
         if self._moving == 1:
-            self._mean = self._mean[[1, 1]]
+            self._mean, self._left = self._mean[[1, 1]], self._changed
             self._weight = torch.stack([self._weight[1], torch.zeros(len(GROUPS))])
-        self._moving = max(self._moving - 1, 0)
-        return torch.cat([likeliest(found), closes], 1)
+        self._moving, self._tcp = max(self._moving - 1, 0), tcp
+        return torch.cat([likeliest(found), closes, left], 1)

@@ -17,7 +17,7 @@ from torch import Tensor
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.sight.estimates import estimate_from, likeliest
 
-KEY_POSE_DIM = 13  # of `features`
+KEY_POSE_DIM = 17  # of `features`
 _POSE = 9  # position, and two columns of the rotation matrix
 HOLD_SECONDS = 0.5  # s in which the fingers move
 _LEVELS = 1e-3  # m between the least and the greatest commanded width: less is one width
@@ -32,22 +32,23 @@ _AT = math.sqrt(3) * _NOISE  # m; the training's noise: the head cannot tell it 
 _STILL = 0.0002  # m per tick
 
 
-def next_key_poses(
+def key_poses(
     tcp: Float32[np.ndarray, "n 7"],
     widths: Float32[np.ndarray, " n"],
     lengths: Sequence[int],
     hold: int,
-) -> Float32[np.ndarray, "n 2 8"]:
-    """Return for every tick the TCP pose at the next change of the commanded width, or at the end.
+) -> Float32[np.ndarray, "n 3 8"]:
+    """Return for every tick the TCP pose at the last change of the commanded width, and at the next ones.
 
-    And 1 if the gripper is closed after it, else 0; then the same of the change that follows. An episode
-    that ends open has let go: then the last change stays, for the hand above what it left looks like the
-    hand above what it will grasp.
+    First that at the last change, and 1; before the first change the present one, and 0. Then that at the
+    next change, or at the end, and 1 if the gripper is closed after it, else 0; and the same of the change
+    that follows. An episode that ends open has let go: then the last change stays the next, for the hand
+    above what it left looks like the hand above what it will grasp.
 
     Args:
         lengths: ticks of each episode, one after the other.
-        hold: ticks for which a key pose stays after the change: until the fingers have moved, nothing
-            shows that it was commanded.
+        hold: ticks for which a key pose stays the next after the change: until the fingers have moved,
+            nothing shows that it was commanded.
     """
     closed = widths < (widths.min() + widths.max()) / 2
     ends = np.cumsum(lengths) - 1
@@ -60,25 +61,38 @@ def next_key_poses(
     after = closed[np.minimum(keys + 1, last)].astype(np.float32)[:, None]
     poses = np.concatenate([tcp[keys], after], 1)
     poses = np.stack([poses, poses[np.arange(len(keys)) + ~final]], 1)
-    return poses[np.searchsorted(until, np.arange(len(tcp)))]
+    tick = np.arange(len(tcp))
+    before = np.append(changes, -1)[np.searchsorted(changes + hold, tick) - 1]
+    known = before > np.repeat(ends - lengths, lengths)
+    left = np.concatenate([tcp[np.where(known, before, tick)], known[:, None]], 1)
+    return np.concatenate([left[:, None], poses[np.searchsorted(until, tick)]], 1, dtype=np.float32)
 
 
-def true_pose(tcp: Float[Tensor, "b 7"], key: Float[Tensor, "b 2 8"]) -> Float[Tensor, "b 10"]:
-    """Return the next key pose in the hand's frame: position, two columns of the rotation; 1 if it closes."""
-    return torch.cat([likeliest(estimate_from(tcp, key[:, 0, :7])), key[:, 0, 7:]], 1)
+def true_pose(tcp: Float[Tensor, "b 7"], key: Float[Tensor, "b 3 8"]) -> Float[Tensor, "b 14"]:
+    """Return key poses in the hand's frame, for `features`.
+
+    Position and two columns of the rotation of the next one, and 1 if the gripper closes there; the position
+    of the last one, and 1, or zeros if there was none.
+    """
+    found = likeliest(estimate_from(tcp, key[:, 1, :7]))
+    left = estimate_from(tcp, key[:, 0, :7])[:, :3]
+    return torch.cat([found, key[:, 1, 7:], left, key[:, 0, 7:]], 1)
 
 
-def features(pose: Float[Tensor, "b 10"], noise: BatchNoise | None = None) -> Float[Tensor, "b 13"]:
-    """Return a policy's input for the key poses in the hand's frame, with the training's noise if given."""
+def features(pose: Float[Tensor, "b 14"], noise: BatchNoise | None = None) -> Float[Tensor, "b 17"]:
+    """Return a policy's input for `true_pose`, or what is seen of it, with the training's noise if given."""
     if noise is not None:
-        scale = torch.tensor([_NOISE] * 3 + [_NOISE / _POSITION * _ROTATION] * 6 + [0])
+        turned = _NOISE / _POSITION * _ROTATION
+        scale = torch.tensor([_NOISE] * 3 + [turned] * 6 + [0] + [_NOISE] * 3 + [0])
         pose = pose + noise.randn(pose.shape).to(pose) * scale.to(pose)
-    away = pose[:, :3]
-    return torch.cat([away / _POSITION, away / (away.abs() + _NEAR), pose[:, 3:]], 1)
+    away, left = pose[:, :3], pose[:, -4:-1] * pose[:, -1:]
+    left = left / (left.abs() + _POSITION)
+    parts = [away / _POSITION, away / (away.abs() + _NEAR), pose[:, 3:10], left, pose[:, -1:]]
+    return torch.cat(parts, 1)
 
 
 def gripper_plan(
-    pose: Float[Tensor, "b 10"],
+    pose: Float[Tensor, "b 14"],
     tcp: Float[Tensor, "b o 7"],
     planned: Float[Tensor, "b h"],
     width: float,
@@ -90,7 +104,7 @@ def gripper_plan(
     plan to, even where recordings change within the plan more often than not.
 
     Args:
-        pose: of the next key pose in the hand's frame.
+        pose: as from `true_pose`.
         tcp: of the observed ticks.
         widths: the two that are commanded.
     """
@@ -98,29 +112,29 @@ def gripper_plan(
     moved = (tcp[:, 1:, :3] - tcp[:, :-1, :3]).norm(dim=2)
     rests = (moved < _STILL).all(1, keepdim=True)
     planned = planned.where(rests & (away < _REACHED), width)
-    after = torch.where(pose[:, 9:] > 0.5, min(widths), max(widths))
+    after = torch.where(pose[:, 9:10] > 0.5, min(widths), max(widths))
     return torch.where(rests & (away < _AT), after, planned)
 
 
 def face_any_way(
-    pose: Float[Tensor, "b 10"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
-) -> tuple[Float[Tensor, "b 10"], Float[Tensor, "b h 8"]]:
-    """Return key poses and plans ("body_twist") as where hand and key pose face another way about the approach.
+    pose: Float[Tensor, "b 14"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
+) -> tuple[Float[Tensor, "b 14"], Float[Tensor, "b h 8"]]:
+    """Return `true_pose` and plans ("body_twist") as where all faces another way about the hand's approach.
 
     Few recordings go the same way as seen from the hand; how they go does not depend on it.
     """
     axes = _about_z(2 * math.pi * noise.rand((len(pose), 1)).to(pose))
     x, y = pose[:, 3:_POSE].split(3, 1)
     rows = axes.mT @ torch.stack([x, y, torch.linalg.cross(x, y)], 1) @ axes
-    place = pose[:, None, :3] @ axes
-    there = torch.cat([place[:, 0], rows[:, :2].flatten(1), pose[:, _POSE:]], 1)
+    place, left = pose[:, None, :3] @ axes, pose[:, None, -4:-1] @ axes
+    parts = [place[:, 0], rows[:, :2].flatten(1), pose[:, 9:10], left[:, 0], pose[:, -1:]]
     turned = [chunk[..., :3] @ axes, chunk[..., 3:6] @ axes, chunk[..., 6:]]
-    return there, torch.cat(turned, 2)
+    return torch.cat(parts, 1), torch.cat(turned, 2)
 
 
 def set_beside(
-    pose: Float[Tensor, "b 10"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
-) -> tuple[Float[Tensor, "b 10"], Float[Tensor, "b h 8"]]:
+    pose: Float[Tensor, "b 14"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
+) -> tuple[Float[Tensor, "b 14"], Float[Tensor, "b h 8"]]:
     """Return half of the near key poses and plans ("body_twist") as from a hand beside the recorded one.
 
     The plans lead it back: recordings hardly show how errors are corrected. Where the gripper changes
@@ -133,12 +147,13 @@ def set_beside(
     moved &= noise.rand((len(pose),)).to(pose) < 0.5
     shift, turn = (drawn * moved[:, None]).split([3, 1], 1)
     axes = _about_z(turn)
-    there = torch.cat([pose[:, :3] + shift, pose[:, 3:_POSE]], 1).unflatten(1, (3, 3)) @ axes
+    rows = [pose[:, :3] + shift, pose[:, 3:_POSE], pose[:, -4:-1] + shift * pose[:, -1:]]
+    there = (torch.cat(rows, 1).unflatten(1, (4, 3)) @ axes).flatten(1)
+    there = torch.cat([there[:, :_POSE], pose[:, 9:10], there[:, _POSE:], pose[:, -1:]], 1)
     back = (torch.arange(1, chunk.shape[1] + 1).to(chunk) / _BACK).clamp(max=1)[:, None]
     position = (chunk[..., :3] + back * shift[:, None]) @ axes
     rotation = chunk[..., 3:6] @ axes
     rotation = torch.cat([rotation[..., :2], rotation[..., 2:] + back * turn[:, None]], 2)
-    there = torch.cat([there.flatten(1), pose[:, _POSE:]], 1)
     return there, torch.cat([position, rotation, chunk[..., 6:]], 2)
 
 

@@ -17,7 +17,7 @@ from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.sight.frozen_images import ImageEmbedder
-from touchgoal.policies.sight.key_pose import HOLD_SECONDS, next_key_poses
+from touchgoal.policies.sight.key_pose import HOLD_SECONDS, key_poses
 from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import Workers
@@ -35,7 +35,7 @@ class Recordings:
     pictures: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
     wrench: Float32[Tensor, "n 12"] | None = None  # on both pads (N, Nm, pad frames), if trained on
     maps: Float16[Tensor, "n k c y x"] | None = None  # of the cameras, see `ImageEmbedder`
-    key_pose: Float32[Tensor, "n 2 8"] | None = None  # the next two, beside `maps`
+    key_pose: Float32[Tensor, "n 3 8"] | None = None  # the last and the next two, beside `maps`
 
 
 def load_recordings(
@@ -78,7 +78,7 @@ def load_recordings(
     key_pose, hold = None, round(HOLD_SECONDS * config.control_hz)
     if images:
         widths = parts[2][:, -1].numpy()
-        key_pose = torch.from_numpy(next_key_poses(np.concatenate(tcp), widths, lengths, hold))
+        key_pose = torch.from_numpy(key_poses(np.concatenate(tcp), widths, lengths, hold))
     return Recordings(
         *parts,
         lengths=lengths,
@@ -205,6 +205,6 @@ class SequenceDataset:
         wrench = self.recorded.wrench
         return None if wrench is None else wrench[self._observed[rows]]
 
-    def key_pose(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b 2 8"] | None:
-        """Return the next key poses at the latest tick of some windows, with cameras."""
+    def key_pose(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b 3 8"] | None:
+        """Return the key poses at the latest tick of some windows, with cameras."""
         return None if self.recorded.key_pose is None else self.recorded.key_pose[rows]

@@ -127,7 +127,7 @@ class _PolicyLoss(nn.Module):
         wrench: Float[Tensor, "b o 12"] | None,
         actions: Float[Tensor, "b h 8"],
         action_is_pad: Bool[Tensor, "b h"],
-        key_pose: Float[Tensor, "b 2 8"] | None,
+        key_pose: Float[Tensor, "b 3 8"] | None,
         noise: BatchNoise,
     ) -> dict[str, Tensor]:
         batch = ObservationBatch(touch, state, pictures, maps)
@@ -170,7 +170,7 @@ def _validate(
     batch = _validation_batch(policy, windows, config)
     generator = torch.Generator().manual_seed(seed)
     observed = _observed(batch)
-    planned = policy.plan(observed, generator)
+    planned = policy.plan(observed, generator, key_pose=batch["key_pose"])
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
     error = off.sum(1).norm(dim=1).mean()
