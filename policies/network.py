@@ -307,7 +307,7 @@ class PolicyNetwork(nn.Module):
                 actions[..., -1] = width if keeps else seen
         return actions
 
-    def _see(self, batch: ObservationBatch, average: KeyPoseAverage) -> Float[Tensor, "b 14"]:
+    def _see(self, batch: ObservationBatch, average: KeyPoseAverage) -> Float[Tensor, "b 11"]:
         """Return the key poses in the hand's frame, as the cameras have shown them."""
         assert self.key_pose and batch.maps is not None, "needs the cameras' feature maps"
         tcp, width = self._hand(batch.state[:, -1])
@@ -329,7 +329,7 @@ class PolicyNetwork(nn.Module):
         self,
         batch: ObservationBatch,
         touch: Float[Tensor, "b o w"],
-        pose: Float[Tensor, "b 14"] | None,
+        pose: Float[Tensor, "b 11"] | None,
         noise: BatchNoise | None = None,
     ) -> Float[Tensor, "b c"]:
         """Return the head's whole input, with the training's noise if given."""

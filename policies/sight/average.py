@@ -10,11 +10,10 @@ from touchgoal.policies.sight.estimates import (
     ESTIMATE_DIM,
     FIXED,
     GROUPS,
-    estimate_from,
     likeliest,
     seen_from,
 )
-from touchgoal.policies.sight.key_pose import HOLD_SECONDS
+from touchgoal.policies.sight.key_pose import HOLD_SECONDS, nearness
 from touchgoal.policies.sight.readout import SEEN, repeated
 
 _MEMORY = 1.0  # s after which an estimate weighs 1/e in the average
@@ -53,7 +52,7 @@ class KeyPoseAverage:
         estimate: Float[Tensor, "1 2 11"],
         weight: Float[Tensor, "1 2 5"],
         tcp: Float[Tensor, "1 7"],
-    ) -> Float[Tensor, "1 14"]:
+    ) -> Float[Tensor, "1 11"]:
         """Add estimates seen from the hand with their weights; return what is known, as by `true_pose`."""
         fixed, hand = torch.tensor([FIXED]).expand(SEEN, 7), tcp.expand(SEEN, 7)
         if not self.gripper_moves:
@@ -64,11 +63,9 @@ class KeyPoseAverage:
             self._mean = torch.lerp(self._mean, seen, torch.cat([share, share[:, :1]], 1))
         found = seen_from(hand[:1], self._mean[:1, :-1], fixed[:1])
         closes = (self._mean[:1, -1:] > 0.5).float()
-        left = torch.zeros(1, 4)
-        if self._left is not None:
-            left = torch.cat([estimate_from(tcp, self._left)[:, :3], torch.ones(1, 1)], 1)
+        near = torch.zeros(1, 1) if self._left is None else nearness(tcp, self._left[:, :3])
         if self._moving == 1:
             self._mean, self._left = self._mean[[1, 1]], self._changed
             self._weight = torch.stack([self._weight[1], torch.zeros(len(GROUPS))])
         self._moving, self._tcp = max(self._moving - 1, 0), tcp
-        return torch.cat([likeliest(found), closes, left], 1)
+        return torch.cat([likeliest(found), closes, near], 1)

@@ -17,7 +17,7 @@ from torch import Tensor
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.sight.estimates import estimate_from, likeliest
 
-KEY_POSE_DIM = 17  # of `features`
+KEY_POSE_DIM = 14  # of `features`
 _POSE = 9  # position, and two columns of the rotation matrix
 HOLD_SECONDS = 0.5  # s in which the fingers move
 _LEVELS = 1e-3  # m between the least and the greatest commanded width: less is one width
@@ -68,31 +68,36 @@ def key_poses(
     return np.concatenate([left[:, None], poses[np.searchsorted(until, tick)]], 1, dtype=np.float32)
 
 
-def true_pose(tcp: Float[Tensor, "b 7"], key: Float[Tensor, "b 3 8"]) -> Float[Tensor, "b 14"]:
-    """Return key poses in the hand's frame, for `features`.
+def true_pose(tcp: Float[Tensor, "b 7"], key: Float[Tensor, "b 3 8"]) -> Float[Tensor, "b 11"]:
+    """Return what sight tells if it is perfect: the next key pose in the hand's frame, and what is around it.
 
-    Position and two columns of the rotation of the next one, and 1 if the gripper closes there; the position
-    of the last one, and 1, or zeros if there was none.
+    Position and two columns of the rotation; 1 if the gripper closes there; see `nearness` of the last one.
     """
     found = likeliest(estimate_from(tcp, key[:, 1, :7]))
-    left = estimate_from(tcp, key[:, 0, :7])[:, :3]
-    return torch.cat([found, key[:, 1, 7:], left, key[:, 0, 7:]], 1)
+    return torch.cat([found, key[:, 1, 7:], key[:, 0, 7:] * nearness(tcp, key[:, 0, :3])], 1)
 
 
-def features(pose: Float[Tensor, "b 14"], noise: BatchNoise | None = None) -> Float[Tensor, "b 17"]:
+def nearness(tcp: Float[Tensor, "b 7"], left: Float[Tensor, "b 3"]) -> Float[Tensor, "b 1"]:
+    """Return how near the hand is to where the gripper last changed: from 1, there, to 0, far away.
+
+    It shows whether a grasp is still to be left, where the way to the next key pose would be along the table.
+    """
+    away = (tcp[:, :3] - left).norm(dim=1, keepdim=True)
+    return (-(away / _POSITION).square() / 2).exp()
+
+
+def features(pose: Float[Tensor, "b 11"], noise: BatchNoise | None = None) -> Float[Tensor, "b 14"]:
     """Return a policy's input for `true_pose`, or what is seen of it, with the training's noise if given."""
     if noise is not None:
         turned = _NOISE / _POSITION * _ROTATION
-        scale = torch.tensor([_NOISE] * 3 + [turned] * 6 + [0] + [_NOISE] * 3 + [0])
+        scale = torch.tensor([_NOISE] * 3 + [turned] * 6 + [0, 0])
         pose = pose + noise.randn(pose.shape).to(pose) * scale.to(pose)
-    away, left = pose[:, :3], pose[:, -4:-1] * pose[:, -1:]
-    left = left / (left.abs() + _POSITION)
-    parts = [away / _POSITION, away / (away.abs() + _NEAR), pose[:, 3:10], left, pose[:, -1:]]
-    return torch.cat(parts, 1)
+    away = pose[:, :3]
+    return torch.cat([away / _POSITION, away / (away.abs() + _NEAR), pose[:, 3:]], 1)
 
 
 def gripper_plan(
-    pose: Float[Tensor, "b 14"],
+    pose: Float[Tensor, "b 11"],
     tcp: Float[Tensor, "b o 7"],
     planned: Float[Tensor, "b h"],
     width: float,
@@ -117,8 +122,8 @@ def gripper_plan(
 
 
 def face_any_way(
-    pose: Float[Tensor, "b 14"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
-) -> tuple[Float[Tensor, "b 14"], Float[Tensor, "b h 8"]]:
+    pose: Float[Tensor, "b 11"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
+) -> tuple[Float[Tensor, "b 11"], Float[Tensor, "b h 8"]]:
     """Return `true_pose` and plans ("body_twist") as where all faces another way about the hand's approach.
 
     Few recordings go the same way as seen from the hand; how they go does not depend on it.
@@ -126,15 +131,15 @@ def face_any_way(
     axes = _about_z(2 * math.pi * noise.rand((len(pose), 1)).to(pose))
     x, y = pose[:, 3:_POSE].split(3, 1)
     rows = axes.mT @ torch.stack([x, y, torch.linalg.cross(x, y)], 1) @ axes
-    place, left = pose[:, None, :3] @ axes, pose[:, None, -4:-1] @ axes
-    parts = [place[:, 0], rows[:, :2].flatten(1), pose[:, 9:10], left[:, 0], pose[:, -1:]]
+    place = pose[:, None, :3] @ axes
+    there = torch.cat([place[:, 0], rows[:, :2].flatten(1), pose[:, _POSE:]], 1)
     turned = [chunk[..., :3] @ axes, chunk[..., 3:6] @ axes, chunk[..., 6:]]
-    return torch.cat(parts, 1), torch.cat(turned, 2)
+    return there, torch.cat(turned, 2)
 
 
 def set_beside(
-    pose: Float[Tensor, "b 14"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
-) -> tuple[Float[Tensor, "b 14"], Float[Tensor, "b h 8"]]:
+    pose: Float[Tensor, "b 11"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
+) -> tuple[Float[Tensor, "b 11"], Float[Tensor, "b h 8"]]:
     """Return half of the near key poses and plans ("body_twist") as from a hand beside the recorded one.
 
     The plans lead it back: recordings hardly show how errors are corrected. Where the gripper changes
@@ -147,9 +152,8 @@ def set_beside(
     moved &= noise.rand((len(pose),)).to(pose) < 0.5
     shift, turn = (drawn * moved[:, None]).split([3, 1], 1)
     axes = _about_z(turn)
-    rows = [pose[:, :3] + shift, pose[:, 3:_POSE], pose[:, -4:-1] + shift * pose[:, -1:]]
-    there = (torch.cat(rows, 1).unflatten(1, (4, 3)) @ axes).flatten(1)
-    there = torch.cat([there[:, :_POSE], pose[:, 9:10], there[:, _POSE:], pose[:, -1:]], 1)
+    there = torch.cat([pose[:, :3] + shift, pose[:, 3:_POSE]], 1).unflatten(1, (3, 3)) @ axes
+    there = torch.cat([there.flatten(1), pose[:, _POSE:]], 1)
     back = (torch.arange(1, chunk.shape[1] + 1).to(chunk) / _BACK).clamp(max=1)[:, None]
     position = (chunk[..., :3] + back * shift[:, None]) @ axes
     rotation = chunk[..., 3:6] @ axes
