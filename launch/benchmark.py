@@ -49,6 +49,7 @@ BENCHMARKS = {
     "faults": ("deployment.faults", "what a deployment does under every fault"),
     "policy-delay": ("deployment.policy_delay", "success under delays, or by cause of failure"),
     "replay": ("deployment.replay", "the same actions in the environment and over the wire"),
+    "own-task": ("deployment.own_task", "a task known by demonstrations alone: success by sight"),
     "audit": ("deployment.audit", "inputs that a policy's success depends on"),
     "robustness": ("deployment.robustness", "success under changes that training has not shown"),
     "sent-stream": ("deployment.sent_stream", "commands to the arm against every limit"),
