@@ -311,7 +311,8 @@ class PolicyNetwork(nn.Module):
         """Return the key poses in the hand's frame, as the cameras have shown them."""
         assert self.key_pose and batch.maps is not None, "needs the cameras' feature maps"
         tcp, width = self._hand(batch.state[:, -1])
-        return average.add(*self.key_pose(batch.maps.float(), tcp, width), tcp)
+        seen, weight = self.key_pose(batch.maps.float(), tcp, width)
+        return average.add(seen, weight, tcp)
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None

@@ -15,7 +15,7 @@ from touchgoal.policies.sight.average import KeyPoseAverage
 from touchgoal.policies.sight.estimates import FIXED, GROUPS, estimate_from, likeliest, seen_from
 from touchgoal.policies.sight.frozen_images import ImageInputConfig
 from touchgoal.policies.sight.key_pose import face_any_way, key_poses, set_beside, true_pose
-from touchgoal.policies.sight.readout import KeyPoseReadout, errors
+from touchgoal.policies.sight.readout import CameraReadout, KeyPoseReadout, errors
 
 
 @pytest.mark.parametrize(
@@ -266,8 +266,10 @@ def test_the_gripper_changes_where_the_hand_rests_at_a_key_pose_and_no_velocity_
         return plan(width)[..., -1]
 
     assert network.key_pose
-    (camera,) = network.key_pose.cameras
+    camera = network.key_pose.cameras[0]
+    assert isinstance(camera, CameraReadout)
     last, turns = camera.places[-1], camera.turns[-1]
+    assert isinstance(last, torch.nn.Linear) and isinstance(turns, torch.nn.Linear)
     for layer in (last, turns):
         torch.nn.init.zeros_(layer.weight)
         torch.nn.init.zeros_(layer.bias)  # at the key pose

@@ -26,11 +26,11 @@ _OPEN = 0.9  # of the range of widths, from the least
 _LEAST, _MOST = -5.0, 3.0  # logarithm of a camera's expected error
 
 
-class _Camera(nn.Module):
+class CameraReadout(nn.Module):
     """Estimates by one camera, seen from its frame, the errors that it expects, and what the gripper does.
 
     Places and turns have networks of their own: where one camera cannot see how a thing is turned, what is
-    learned by heart for it would make places wrong, too (by 5 cm in place of 8 mm).
+    learned by heart for it makes places wrong, too.
     """
 
     def __init__(self, config: ImageInputConfig) -> None:
@@ -43,6 +43,7 @@ class _Camera(nn.Module):
         self.turns = readout(width, 128, SEEN * (turns + turn_groups))
 
     def fit(self, maps: Float16[Tensor, "n c y x"], places: Float[Tensor, "m 3"]) -> None:
+        """Fit the normalizers to training data: places seen from the camera's frame, m."""
         self.place_images.fit(maps)
         self.turn_images.fit(maps)
         self.normalizer.fit_mean_std(places)
@@ -50,6 +51,7 @@ class _Camera(nn.Module):
     def forward(
         self, maps: Float[Tensor, "b c y x"], state: Float[Tensor, "b 2"]
     ) -> tuple[Float[Tensor, "b 2 10"], Float[Tensor, "b 2 5"], Float[Tensor, "b 2"]]:
+        """Return estimates, logarithms of the errors expected, and logits of the gripper's being closed."""
         seen = torch.cat([self.place_images(maps), state], 1)
         found = self.places(seen).unflatten(1, (SEEN, -1))
         place, place_error, closed = found.split([_PLACE, _PLACE_GROUPS, 1], 2)
@@ -72,7 +74,7 @@ class KeyPoseReadout(nn.Module):
     def __init__(self, config: ImageInputConfig) -> None:
         super().__init__()
         self.on_hand = config.on_hand
-        self.cameras = nn.ModuleList(_Camera(config) for _ in config.cameras)
+        self.cameras = nn.ModuleList(CameraReadout(config) for _ in config.cameras)
         self.height_normalizer = Normalizer((1,))
         self.open_width = nn.Buffer(torch.zeros(1))  # m; at less the gripper is closed, or closes
         # added to the logarithms of the expected errors
@@ -88,7 +90,7 @@ class KeyPoseReadout(nn.Module):
         """Fit the normalizers to training data."""
         true = self._true(tcp, key)
         for k, camera in enumerate(self.cameras):
-            cast(_Camera, camera).fit(maps[:, k], true[:, k, :, :_PLACE].flatten(0, 1))
+            cast(CameraReadout, camera).fit(maps[:, k], true[:, k, :, :_PLACE].flatten(0, 1))
         self.height_normalizer.fit_mean_std(tcp[:, 2:3])
         self.open_width.copy_(width.amin() + _OPEN * (width.amax() - width.amin()))
 
