@@ -6,13 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from touchgoal.policies.sight.estimates import (
-    ESTIMATE_DIM,
-    FIXED,
-    GROUPS,
-    likeliest,
-    seen_from,
-)
+from touchgoal.policies.sight.estimates import ESTIMATE_DIM, FIXED, GROUPS, likeliest, seen_from
 from touchgoal.policies.sight.key_pose import HOLD_SECONDS, nearness
 from touchgoal.policies.sight.readout import SEEN, repeated
 
@@ -33,10 +27,8 @@ class KeyPoseAverage:
         self._tcp: Float[Tensor, "1 7"] | None = None  # at the latest estimate
         self._changed: Float[Tensor, "1 7"] | None = None  # where the gripper last changed
         self._left: Float[Tensor, "1 7"] | None = None  # the same, once the fingers have moved
-        self._weight, self._mean = (
-            torch.zeros(SEEN, len(GROUPS)),
-            torch.zeros(SEEN, ESTIMATE_DIM + 1),
-        )
+        self._weight = torch.zeros(SEEN, len(GROUPS))
+        self._mean = torch.zeros(SEEN, ESTIMATE_DIM + 1)
 
     @property
     def gripper_moves(self) -> bool:

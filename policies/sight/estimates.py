@@ -21,19 +21,13 @@ from torch import Tensor
 from touchgoal.policies.perception.proprioception import rotation_6d
 
 ESTIMATE_DIM = 10
-GROUPS = (
-    2,
-    1,
-    3,
-    2,
-    2,
-)  # across the frame's z axis, along it; approach; twice and four times the turn
+# across the frame's z axis and along it (m), approach, twice and four times the turn
+GROUPS = 2, 1, 3, 2, 2
 SCALES = 0.05, 0.05, 0.3, 0.6, 1.2  # errors that weigh alike: m, m, rad, and rad of the multiples
 FIXED = 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0  # a pose: position (m), quaternion (wxyz)
 _DEGREES = 180  # turns that are told apart, a half turn in all
-_STAY = (
-    0.1  # share of a sure estimate by which the present turn is preferred: no change between equals
-)
+# by how much of a sure estimate the present turn is preferred: no change from one of two equals
+_STAY = 0.1
 
 
 def estimate_from(frame: Float[Tensor, "b 7"], pose: Float[Tensor, "b 7"]) -> Float[Tensor, "b 10"]:
