@@ -92,6 +92,8 @@ def _deploy(cell: Path, policy: Path, seed: int, config: Config) -> OwnTaskRun:
         "deploy", cell, "--task", _TASK, "--policy", policy, "--execute", "--yes", "--seed", seed,
         "--out", out,
     )  # fmt: skip
+    if not (out / "metrics.json").exists():  # the twin still has the scene before
+        return OwnTaskRun(seed, False, 0.0, f"refused: {' '.join(done.stderr.split())[-300:]}")
     truth = ask_twin(read_cell_file(cell).task.twin, "truth")
     ending = ([line for line in done.stderr.splitlines() if line] or ["done"])[-1]
     return OwnTaskRun(seed, truth["success"], truth["progress"], ending)
