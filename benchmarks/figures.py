@@ -16,11 +16,6 @@ def _rate(trials: list[Metrics]) -> SuccessRate:
     return SuccessRate(sum(trial["success"] for trial in trials), len(trials))
 
 
-def tried(metrics: Metrics) -> str:
-    """Success rate of all runs."""
-    return str(_rate(metrics["runs"]))
-
-
 def deployed(metrics: Metrics) -> str:
     """Success rate by arm."""
     rows = metrics["deployments"]

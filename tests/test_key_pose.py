@@ -133,8 +133,8 @@ def test_a_camera_finds_a_thing_at_places_never_seen(camera: str) -> None:
     torch.testing.assert_close((made / expected.exp()).mean(0), wanted, atol=1e-3, rtol=0)
 
 
-def _half_a_turn_on(poses: torch.Tensor, share: float = 1.0) -> torch.Tensor:
-    turn = Rotation.from_rotvec([0, 0, np.pi * share])
+def _turned_on(poses: torch.Tensor, half_turns: float) -> torch.Tensor:
+    turn = Rotation.from_rotvec([0, 0, np.pi * half_turns])
     R = Rotation.from_quat(poses[:, 3:].numpy(), scalar_first=True) * turn
     turned = torch.from_numpy(R.as_quat(scalar_first=True)).float()
     return torch.cat([poses[:, :3], turned], 1)
@@ -152,13 +152,12 @@ def test_estimates_turn_into_the_hands_frame_as_scipy_turns_them() -> None:
     found = likeliest(estimate)
     place = hand.inv().apply((key - tcp)[:, :3].numpy())
     np.testing.assert_allclose(found[:, :3], place, atol=1e-5)
-    near = np.sign(
-        (found.numpy()[:, 3:6] * turned[:, :, 0]).sum(1, keepdims=True)
-    )  # or half a turn on
+    # the turn itself, or half a turn on
+    near = np.sign((found.numpy()[:, 3:6] * turned[:, :, 0]).sum(1, keepdims=True))
     np.testing.assert_allclose(near * found.numpy()[:, 3:6], turned[:, :, 0], atol=0.02)  # a degree
     np.testing.assert_allclose(near * found.numpy()[:, 6:], turned[:, :, 1], atol=0.02)
     np.testing.assert_allclose(estimate[:, 3:6], turned[:, :, 2], atol=1e-5)
-    torch.testing.assert_close(estimate_from(tcp, _half_a_turn_on(key)), estimate)
+    torch.testing.assert_close(estimate_from(tcp, _turned_on(key, 1)), estimate)
     fixed = torch.tensor([FIXED]).expand(20, 7)
     there = seen_from(fixed, estimate, tcp)
     torch.testing.assert_close(there, estimate_from(fixed, key))
@@ -169,7 +168,7 @@ def test_estimates_turn_into_the_hands_frame_as_scipy_turns_them() -> None:
 def test_between_two_ways_to_grasp_a_box_the_mean_is_one_of_them(first: float) -> None:
     rng = np.random.default_rng(4)
     tcp, key = _poses(rng, 20), _poses(rng, 20)
-    ways = [estimate_from(tcp, way) for way in (key, _half_a_turn_on(key, 0.5))]
+    ways = [estimate_from(tcp, way) for way in (key, _turned_on(key, 0.5))]
     found = likeliest(first * ways[0] + (1 - first) * ways[1])
     alike = [(likeliest(way)[:, 3:] - found[:, 3:]).norm(dim=1) < 0.1 for way in ways]
     assert (alike[0] | alike[1]).all()

@@ -221,9 +221,7 @@ def test_the_script_errs_on_its_way_down_and_corrects() -> None:
             way.append([*position, width])
         x_y, z, width = np.split(np.array(way), [2, 3], 1)
         np.testing.assert_allclose(x_y[(width < 0.05)[:, 0]][[0, -1]], ends, atol=0.005)
-        low = (
-            np.abs(z[:, 0] - 0.09) < 0.01
-        )  # where the last way-point, 6 cm above the end, is passed
+        low = np.abs(z[:, 0] - 0.09) < 0.01  # at the last way-point, 6 cm above the end
         assert np.abs(x_y[low, None] - ends).max(2).min(1).max() > 0.003
 
 

@@ -16,6 +16,7 @@ from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 
+REFUSED = "refused"  # how the ending of a deployment that did not begin starts
 _TIMEOUT = 1800.0  # s for one deployment on a loaded machine
 _START_TIMEOUT, _END_TIMEOUT = 300.0, 60.0  # s for a twin, on a loaded machine
 _SHUT = 0.01  # m that fingers must have closed for an attempted grasp
@@ -51,20 +52,24 @@ class Deployment:
 
 
 def deploy(
-    cell: Path, scene: Scene, policy: str, arm: str, seconds: float, out: Path
+    cell: Path, scene: Scene, policy: str, arm: str, seconds: float, out: Path, own_task: str = ""
 ) -> Deployment:
-    """Run `touchgoal deploy --execute` on a cell file in its own process, for some time at most."""
+    """Run `touchgoal deploy --execute` on a cell file in its own process, for some time at most.
+
+    With the name of a task of one's own its success is not known: the scene's truth has it.
+    """
     table = json.loads(cell.read_text())
     table["task"]["seconds"] = seconds
     cell.write_text(json.dumps(table))
     command = [sys.executable, "-m", "touchgoal.launch", "deploy", str(cell), "--policy", policy]
     command += ["--execute", "--yes", "--seed", str(scene.seed), "--out", str(out)]
+    command += ["--task", own_task] if own_task else []
     env = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, env=env)
     kind = (scene.task, policy, arm, scene.seed, scene.item)
     report = out / "metrics.json"
     if not report.exists():  # refused, or crashed
-        ending = f"refused: {' '.join(done.stderr.split())[-300:]}"
+        ending = f"{REFUSED}: {' '.join(done.stderr.split())[-300:]}"
         return Deployment(*kind, False, None, ending, "", 0.0, 0.0, {}, 0.0)
     metrics = json.loads(report.read_text())
     ticks = max(1, metrics["ticks"])

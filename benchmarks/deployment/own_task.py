@@ -5,25 +5,32 @@ deployed; the twin's truth, which neither reads, says whether it succeeded. What
 holds, recordings or policy, is taken from there.
 """
 
-import json
-import os
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from touchgoal.benchmarks.deployment.deployed_episode import Scene, deployed_twin
+from touchgoal.benchmarks.deployment.deployed_episode import (
+    REFUSED,
+    Deployment,
+    Scene,
+    deploy,
+    deployed_twin,
+)
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.twin_client import ask_twin
+from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.policies.training.train import POLICY
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Positive, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
 
-_TASK = "block on disc"
+_TASK, _OBJECT = "block on disc", "wooden_block"
 _RECORDED = {"demonstrations": seeds.TRAINING, "validation": seeds.VALIDATION}
 
 
@@ -32,7 +39,7 @@ class Config(BenchmarkOptions):
     """Options of benchmark own-task."""
 
     work: Path = Path("runs/own-task")
-    """Folder of recordings, policy and deployments."""
+    """Folder of recordings and policy."""
     demonstrations: Count = 50
     """Demonstrations to train on; a tenth as many are recorded to validate on."""
     episodes: Count = 20
@@ -43,70 +50,52 @@ class Config(BenchmarkOptions):
     """Random seed of the first deployment's scene; each further one adds one."""
 
 
-@dataclass(frozen=True)
-class OwnTaskRun:
-    """Result of one deployment, by the twin's truth."""
-
-    seed: int
-    success: bool
-    progress: float
-    ending: str
-
-
 def run(config: Config) -> dict[str, Any]:
     """Record, train and deploy where that is not done yet; return the table."""
     work = config.work
     work.mkdir(parents=True, exist_ok=True)
     counts = config.demonstrations, max(1, config.demonstrations // 10)
-    scene = Scene("pick-place", config.seed, "wooden_block")
-    with deployed_twin(scene, True, work, 0) as cell:
-        for (name, drawn), count in zip(_RECORDED.items(), counts, strict=True):
-            if not (work / name).exists():
+    scene = Scene("pick-place", config.seed, _OBJECT)
+    with TemporaryDirectory() as name, deployed_twin(scene, True, Path(name), 0) as cell:
+        for (kind, drawn), count in zip(_RECORDED.items(), counts, strict=True):
+            if not (work / kind).exists():
                 _touchgoal(
                     "record-demos", cell, "--task", _TASK, "--device", "scripted", "--seed", drawn.start,
-                    "--episodes", count, "--yes", "--out", work / name,
+                    "--episodes", count, "--yes", "--out", work / kind,
                 )  # fmt: skip
+            if (held := len(EpisodeSet(work / kind / "episodes"))) < count:
+                raise UserError(f"{work / kind} holds {held} of {count} recordings: remove it")
         policy = work / "policy"
-        if not policy.exists():
-            data, validation = (work / name / "episodes" for name in _RECORDED)
+        if not (policy / POLICY).exists():
+            data, validation = (work / kind / "episodes" for kind in _RECORDED)
             _touchgoal(
                 "train-policy", "--preset", "sight", "--data", data, "--validation", validation,
                 "--out", policy,
             )  # fmt: skip
         drawn = range(config.seed, config.seed + config.episodes)
-        runs = [
+        rows = [
             _deploy(cell, policy, seed, config) for seed in track(drawn, "deploying", "deployment")
         ]
-    rate = SuccessRate(sum(r.success for r in runs), len(runs))
+    rate = SuccessRate(sum(row.success for row in rows), len(rows))
     lines = [f"{_TASK}, {config.demonstrations} demonstrations: {rate} [95 % Wilson]"]
-    lines += [f"    {r.seed}: progress {r.progress:.2f}, {r.ending}" for r in runs if not r.success]
-    return {"table": "\n".join(lines), "runs": [asdict(r) for r in runs]}
+    lines += [
+        f"    {r.seed}: progress {r.progress or 0:.2f}, {r.ending}" for r in rows if not r.success
+    ]
+    return {"table": "\n".join(lines), "deployments": [asdict(row) for row in rows]}
 
 
-def _deploy(cell: Path, policy: Path, seed: int, config: Config) -> OwnTaskRun:
-    table = json.loads(cell.read_text())
-    table["task"]["seconds"] = config.seconds
-    cell.write_text(json.dumps(table))
-    out = config.work / "deployments" / str(seed)
-    done = _start(
-        "deploy", cell, "--task", _TASK, "--policy", policy, "--execute", "--yes", "--seed", seed,
-        "--out", out,
-    )  # fmt: skip
-    if not (out / "metrics.json").exists():  # the twin still has the scene before
-        return OwnTaskRun(seed, False, 0.0, f"refused: {' '.join(done.stderr.split())[-300:]}")
+def _deploy(cell: Path, policy: Path, seed: int, config: Config) -> Deployment:
+    scene, out = Scene("pick-place", seed, _OBJECT), cell.parent / str(seed)
+    done = deploy(cell, scene, str(policy), "lock-step", config.seconds, out, _TASK)
+    if done.ending.startswith(REFUSED):  # the twin still has the scene before
+        return done
     truth = ask_twin(read_cell_file(cell).task.twin, "truth")
-    ending = ([line for line in done.stderr.splitlines() if line] or ["done"])[-1]
-    return OwnTaskRun(seed, truth["success"], truth["progress"], ending)
+    return replace(done, success=truth["success"], progress=truth["progress"])
 
 
 def _touchgoal(*arguments: object) -> None:
-    """Run a command that must succeed; UserError with its last line if it does not."""
-    done = _start(*arguments)
+    """Run a command; UserError with the end of what it says if it fails."""
+    command = [sys.executable, "-m", "touchgoal.launch", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise UserError(f"{arguments[0]}: {' '.join(done.stderr.split())[-300:]}")
-
-
-def _start(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "touchgoal.launch", *map(str, arguments)]
-    env = {**os.environ, "OMP_NUM_THREADS": str(os.cpu_count() or 1)}
-    return subprocess.run(command, capture_output=True, text=True, env=env, check=False)

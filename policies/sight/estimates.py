@@ -25,7 +25,7 @@ ESTIMATE_DIM = 10
 GROUPS = 2, 1, 3, 2, 2
 SCALES = 0.05, 0.05, 0.3, 0.6, 1.2  # errors that weigh alike: m, m, rad, and rad of the multiples
 FIXED = 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0  # a pose: position (m), quaternion (wxyz)
-_DEGREES = 180  # turns that are told apart, a half turn in all
+_DEGREES = 180  # candidate turns, a degree apart: half a turn in all
 # by how much of a sure estimate the present turn is preferred: no change from one of two equals
 _STAY = 0.1
 

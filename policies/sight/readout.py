@@ -29,8 +29,8 @@ _LEAST, _MOST = -5.0, 3.0  # logarithm of a camera's expected error
 class CameraReadout(nn.Module):
     """Estimates by one camera, seen from its frame, the errors that it expects, and what the gripper does.
 
-    Places and turns have networks of their own: where one camera cannot see how a thing is turned, what is
-    learned by heart for it makes places wrong, too.
+    Place and turn have separate networks. A camera that cannot see a turn memorises it for each recording;
+    with shared keypoints that would make places wrong, too.
     """
 
     def __init__(self, config: ImageInputConfig) -> None:
@@ -159,8 +159,8 @@ class KeyPoseReadout(nn.Module):
         key: Float[Tensor, "b 2 8"],
     ) -> Float[Tensor, "b 2"]:
         """Return how far the estimates are off, m."""
-        true = torch.stack([estimate_from(tcp, key[:, n, :7]) for n in range(SEEN)], 1)
-        return (self(maps, tcp, width)[0] - F.pad(true, (0, 1)))[..., :_PLACE].norm(dim=-1)
+        off = self(maps, tcp, width)[0][..., :-1] - _seen(tcp, key)
+        return off[..., :_PLACE].norm(dim=-1)
 
     def estimates(
         self,
@@ -187,11 +187,12 @@ class KeyPoseReadout(nn.Module):
         self, tcp: Float[Tensor, "b 7"], key: Float[Tensor, "b 2 8"]
     ) -> Float[Tensor, "b k 2 10"]:
         """Return what each camera should estimate."""
-        rows = [
-            torch.stack([estimate_from(frame, key[:, n, :7]) for n in range(SEEN)], 1)
-            for frame in self._frames(tcp)
-        ]
-        return torch.stack(rows, 1)
+        return torch.stack([_seen(frame, key) for frame in self._frames(tcp)], 1)
+
+
+def _seen(frame: Float[Tensor, "b 7"], key: Float[Tensor, "b 2 8"]) -> Float[Tensor, "b 2 10"]:
+    """Return the estimates that true key poses are, seen from `frame`."""
+    return torch.stack([estimate_from(frame, key[:, n, :7]) for n in range(SEEN)], 1)
 
 
 def errors(
