@@ -27,6 +27,8 @@ from touchgoal.sim_envs.tasks import task_name
 
 Task = TypeVar("Task", bound=EnvConfig)
 
+_USUAL_AGE = 0.1  # s; the oldest measurement is at most so old as deployed, see `AS_DEPLOYED`
+
 
 @runtime_checkable
 class Estimator(Protocol):
@@ -42,7 +44,8 @@ class Estimator(Protocol):
 class LearnedPolicy:
     """A trained network that acts, one episode after the other.
 
-    It executes `execution_horizon` ticks of each plan. The same seed and observations give the same
+    It executes `execution_horizon` ticks of each plan, slower if what it observes is late
+    (`speed_for_age`). The same seed and observations give the same
     actions. Torch computes each plan on one thread: two are much slower when another process uses a
     core.
 
@@ -141,11 +144,19 @@ class LearnedPolicy:
             self._refuse_novel(batch)
             rest = self._generator, self._width, self._key_pose
             actions = self._network.plan(batch, *rest)[0].numpy()
+            actions[:, :-1] *= self._speed(history[-1])
             width = float(actions[self.config.execution_horizon - 1, -1])
             if self._width not in (None, width):
                 self._key_pose.go_on()
             self._width = width
             return actions
+
+    def _speed(self, observation: Observation) -> float:
+        """Return the share of the planned motion to do; all of it where no age is known."""
+        age = observation.get(ft.AGE, np.zeros(1)).item()
+        # The last action of a plan comes a tick and `execution_horizon` ticks after its observation.
+        reaction = (1 + self.config.execution_horizon) / self.config.control_hz
+        return speed_for_age(age, reaction)
 
     def _refuse_novel(self, batch: ObservationBatch) -> None:
         """Raise RefusedError once touch has been unlike the training for a second of plans."""
@@ -281,6 +292,16 @@ class LearnedPolicy:
                 f"a plan of {config.prediction_horizon} ticks, {config.execution_horizon} of them "
                 f"done, cannot come {plan_ticks} ticks late: change execution_horizon"
             )
+
+
+def speed_for_age(age: float, reaction: float) -> float:
+    """Return the share of its speed at which a hand goes no further before it reacts than usual.
+
+    Args:
+        age: of the oldest measurement that is observed, s.
+        reaction: time from the observation to the last action that follows from it, s.
+    """
+    return (_USUAL_AGE + reaction) / (max(age, _USUAL_AGE) + reaction)
 
 
 @contextmanager

@@ -95,15 +95,16 @@ class FakeGripper:
 
 @dataclass
 class FakeCamera:
-    """A camera that shows one picture, new each time."""
+    """A camera that shows one picture, new each time and `late` (s)."""
 
     clock: FakeClock
     image: np.ndarray
     rate: float = 30.0
     problem: str = ""
+    late: float = 0.0
 
     def read(self) -> Frame:
-        return Frame(self.image, round(1000 * self.clock.time), self.clock.time)
+        return Frame(self.image, round(1000 * self.clock.time), self.clock.time - self.late)
 
     def close(self) -> None: ...
 

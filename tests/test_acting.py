@@ -52,6 +52,25 @@ def test_an_actor_does_its_plans_in_order_and_on_time(plan_ticks: int) -> None:
     np.testing.assert_allclose(done, expected[:8], rtol=1e-5)
 
 
+def test_late_observations_slow_the_arm_and_not_the_gripper() -> None:
+    """The way until it reacts stays what it is at an age of 0.1 s."""
+    touch = toy_touch_embedder()
+    config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
+    network, tick = toy_policy(config, toy_dataset(config)).eval(), toy_observations(1)[0]
+
+    def plan(age: float) -> np.ndarray:
+        policy = LearnedPolicy(network, touch)
+        return policy.plan([tick | {ft.AGE: np.array([age], np.float32)}] * policy.history_ticks)
+
+    usual, late, later = plan(0.1), plan(0.2), plan(0.4)
+    np.testing.assert_array_equal(plan(0.0), usual)
+    reaction = 4 / config.control_hz  # a tick for the plan, three that it acts
+    for age, actions in ((0.2, late), (0.4, later)):
+        way = actions[:, :-1] * (age + reaction)
+        np.testing.assert_allclose(way, usual[:, :-1] * (0.1 + reaction), rtol=1e-5)
+        np.testing.assert_array_equal(actions[:, -1], usual[:, -1])
+
+
 def test_an_actor_refuses_what_it_cannot_do() -> None:
     touch = toy_touch_embedder()
     policy = PolicyNetwork(replace(TOY, touch_dim=touch.dim))

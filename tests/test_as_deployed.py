@@ -57,6 +57,8 @@ def test_what_is_seen_is_as_old_as_it_says(option: str) -> None:
         now, then = column(here, key), column(late, key)
         assert np.array_equal(then[ticks:], now[: len(now) - ticks]), key
         assert np.array_equal(then[:ticks], now[:1].repeat(ticks, 0)), key
+    assert not column(here, ft.AGE).any()
+    np.testing.assert_allclose(column(late, ft.AGE)[:, 0], np.arange(9).clip(0, 2) / 20, atol=1e-6)
 
 
 def test_a_command_arrives_so_late() -> None:

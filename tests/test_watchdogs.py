@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_cell import FakeCell, FakeLoadCell
+from fake_cell import FakeCamera, FakeCell, FakeLoadCell
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.hand import HandMonitor, HeldObject
@@ -78,6 +78,16 @@ def test_what_presses_on_the_table_is_recorded_and_stops_the_arm() -> None:
         ending = cell.run(at(10, lambda c=cell, n=change: setattr(c.load_cell, "force", 55 + n)))
         assert ending.stopped and "load on the table 40" in ending.reason
         assert [row[ft.LOAD].item() for row in cell.log.rows] == [55.0] * len(cell.log.rows)
+
+
+def test_a_policy_is_told_how_old_its_observation_is() -> None:
+    cell = FakeCell()
+    camera = FakeCamera(cell.clock, np.zeros(ft.CAMERA_SHAPE, np.uint8))
+    cell.cameras[ft.FRONT] = camera
+    ending = cell.run(at(10, lambda: setattr(camera, "late", 0.08)), step=0.001, seconds=1.0)
+    assert not ending.stopped
+    ages = [row[ft.AGE].item() for row in cell.log.rows]
+    assert ages == pytest.approx([0.0] * 10 + [0.08] * (len(ages) - 10)) and len(ages) > 15
 
 
 def test_an_arm_that_took_other_devices_along_is_what_the_operator_reads() -> None:

@@ -19,10 +19,11 @@ from touchgoal.sim_envs.surroundings import Surroundings
 _LIGHT = {
     f"light {change:+.0%}": {"light_change": (change,)} for change in (-0.15, -0.05, 0.1, -0.8)
 }
-_DELAYED = {  # state and pictures; at 20 Hz a tick is 50 ms
+_DELAYED = {  # state and pictures; at 20 Hz a tick is 50 ms; learned policies go slower
     f"{ticks} ticks late": {"state_delay": (s, s), "picture_delay": (s, s)}
     for ticks, s in ((2, 0.1), (4, 0.2))
 }
+_LONGER = 1.5  # times as long may an episode with late observations last
 _FROZEN = {"every second picture frozen": {"picture_rate": 10.0}}
 _CHANGES: dict[SimulatedTask, dict[str, dict[str, Any]]] = {
     "pick-place": {
@@ -77,7 +78,11 @@ def run(config: Config) -> dict[str, Any]:
 def _environments(config: Config, task: SimulatedTask) -> dict[str, TaskConfig]:
     base = config.environment(task)
     late = {
-        name: replace(base, deployment=replace(base.deployment, **change))
+        name: replace(
+            base,
+            deployment=replace(base.deployment, **change),
+            max_seconds=_LONGER * base.max_seconds,
+        )
         for name, change in (_DELAYED | _FROZEN).items()
     }
     changed = {name: replace(base, **change) for name, change in _CHANGES[task].items()}

@@ -199,7 +199,8 @@ class SafetySection:
     """Indentation of a gel at which the arm stops and the hand opens, m; default: the task's own, at
     most what the sensor file can read."""
     observation_age: Seconds = 0.1
-    """Age of a picture at which the arm holds, s; five times that stops it."""
+    """Age of a picture at which the arm holds, s; five times that stops it. If you raise it, a learned
+    policy goes slower with observations older than 0.1 s."""
     state_age: Seconds = 0.05
     """Age of the arm's state at which the arm holds, s; five times that stops it."""
     state_timeout: Seconds | None = None

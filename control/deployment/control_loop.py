@@ -305,7 +305,9 @@ class ControlLoop:
         """Read the devices, with the commanded positions in the observation."""
         reading = self.reader.read()
         command = np.concatenate([self.state.q, self.state.velocity]).astype(np.float32)
-        return replace(reading, observation={**reading.observation, ft.COMMAND: command})
+        age = max(reading.age, self._connection.clock.age(reading.arm.stamp))
+        known = {ft.COMMAND: command, ft.AGE: np.array([age], np.float32)}
+        return replace(reading, observation={**reading.observation, **known})
 
     def _stop_for_fault(self, reading: CellReading, arm_pace: float) -> Ending:
         fault = self.state.fault

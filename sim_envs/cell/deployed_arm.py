@@ -183,10 +183,11 @@ class DeployedArm:
 
     def observation(self) -> dict[str, np.ndarray]:
         """Return the policy's observation after the last tick."""
-        self._states, state = _latest(self._states, int(self._state_at[self._tick]))
-        self._pictures, latest = _latest(self._pictures, int(self._picture_at[self._tick]))
-        pictures, self.contacts = latest
-        return {**state, **pictures}
+        read, shot = int(self._state_at[self._tick]), int(self._picture_at[self._tick])
+        self._states, state = _latest(self._states, read)
+        self._pictures, (pictures, self.contacts) = _latest(self._pictures, shot)
+        age = (self._ms - (min(read, shot) if pictures else read)) * _DT
+        return {**state, **pictures, ft.AGE: np.array([age], np.float32)}
 
     def _measure(self, read: bool, shoot: bool) -> None:
         env = self._env

@@ -52,6 +52,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
     | `observation.command` | (2n,) | commanded joint positions and velocities | rad, rad/s |
     | `observation.tcp_pose` | (7,) | tool centre point: position, quaternion wxyz | m |
     | `observation.wrench` | (6,) | force and torque on the robot at the TCP | N, Nm |
+    | `observation.age` | (1,) | of its oldest measurement, with `deployment` options | s |
     | `observation.images.<camera>` | (h, w, 3) | RGB, one for each of `cameras` | 0 to 255 |
     | `observation.images.tactile_left` | (h, w, 3) | RGB, left fingertip | 0 to 255 |
     | `observation.images.tactile_right` | (h, w, 3) | RGB, right fingertip | 0 to 255 |
@@ -103,6 +104,8 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
             key: gym.spaces.Box(-np.inf, np.inf, features[key].shape, np.float32)
             for key in (ft.STATE, ft.COMMAND, ft.TCP_POSE, ft.WRENCH)
         }
+        if config.resolved_deployment() != IDEAL_DEPLOYMENT:
+            spaces[ft.AGE] = gym.spaces.Box(0, np.inf, features[ft.AGE].shape, np.float32)
         sizes = {ft.IMAGE_PREFIX + camera: config.camera_size for camera in config.cameras}
         if config.tactile:
             sizes |= dict.fromkeys(ft.TACTILE, self.sensor.image_shape)
