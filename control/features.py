@@ -17,7 +17,7 @@ COMMAND = "observation.command"
 TCP_POSE = "observation.tcp_pose"
 WRENCH = "observation.wrench"
 LOAD = "observation.load"
-AGE = "observation.age"  # as deployed
+AGE = "observation.age"
 FRONT = "observation.images.front"
 WRIST = "observation.images.wrist"
 WAND_VIEWS = tuple(
@@ -90,7 +90,7 @@ _BEFORE_ACTION = {
     LOAD: Feature(
         "float32", (1,), ("fz",), "force on the table's load cell, N; where there is one"
     ),
-    AGE: Feature("float32", (1,), ("age",), "age of its oldest measurement, s; as deployed"),
+    AGE: Feature("float32", (1,), ("age",), "age of its oldest measurement, s"),
     FRONT: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "fixed camera facing the robot, RGB"),
     WRIST: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "camera on the hand, RGB"),
     **{

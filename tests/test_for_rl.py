@@ -20,7 +20,7 @@ def test_keys_actions_and_touch() -> None:
     env = touchgoal.make("pick-place", for_rl=True, cameras=(), **SHORT)
     check_env(env)
     observation, _ = env.reset(seed=0)
-    keys = "state command tcp_pose wrench tactile_left tactile_right"
+    keys = "state command tcp_pose wrench age tactile_left tactile_right"
     assert set(observation) == set(keys.split())
     assert observation["tactile_left"].shape == (*TACTILE_SIZE, 3)
     plain = touchgoal.make("pick-place", cameras=(), **SHORT)

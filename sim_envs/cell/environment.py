@@ -52,7 +52,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
     | `observation.command` | (2n,) | commanded joint positions and velocities | rad, rad/s |
     | `observation.tcp_pose` | (7,) | tool centre point: position, quaternion wxyz | m |
     | `observation.wrench` | (6,) | force and torque on the robot at the TCP | N, Nm |
-    | `observation.age` | (1,) | of its oldest measurement, with `deployment` options | s |
+    | `observation.age` | (1,) | of its oldest measurement | s |
     | `observation.images.<camera>` | (h, w, 3) | RGB, one for each of `cameras` | 0 to 255 |
     | `observation.images.tactile_left` | (h, w, 3) | RGB, left fingertip | 0 to 255 |
     | `observation.images.tactile_right` | (h, w, 3) | RGB, right fingertip | 0 to 255 |
@@ -102,10 +102,8 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         features, config = ft.features_of(self.n_joints), self.config
         spaces: dict[str, gym.Space[Any]] = {
             key: gym.spaces.Box(-np.inf, np.inf, features[key].shape, np.float32)
-            for key in (ft.STATE, ft.COMMAND, ft.TCP_POSE, ft.WRENCH)
+            for key in (ft.STATE, ft.COMMAND, ft.TCP_POSE, ft.WRENCH, ft.AGE)
         }
-        if config.resolved_deployment() != IDEAL_DEPLOYMENT:
-            spaces[ft.AGE] = gym.spaces.Box(0, np.inf, features[ft.AGE].shape, np.float32)
         sizes = {ft.IMAGE_PREFIX + camera: config.camera_size for camera in config.cameras}
         if config.tactile:
             sizes |= dict.fromkeys(ft.TACTILE, self.sensor.image_shape)
@@ -298,7 +296,8 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
             observation = self._deployed.observation()
             self._force.check(observation[ft.WRENCH])  # as `deploy` does
             return observation | command
-        return self.read_proprioception() | self.take_pictures() | command
+        age = {ft.AGE: np.zeros(1, np.float32)}
+        return self.read_proprioception() | self.take_pictures() | command | age
 
     def _read_command(self) -> Float32[np.ndarray, " c"]:
         velocity = (self.command - self._command_before) * self.config.control_hz
