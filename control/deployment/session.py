@@ -213,6 +213,7 @@ def metrics(result: Result) -> dict[str, Any]:
     for row in log.rows[::_LIGHT_TICKS]:
         light.update(row)
     forces = [np.linalg.norm(row[ft.WRENCH][:3]) for row in log.rows]
+    ages = [row[ft.AGE].item() for row in log.rows]
     return {
         "reason": ending.reason,
         "stopped": ending.stopped,
@@ -226,6 +227,7 @@ def metrics(result: Result) -> dict[str, Any]:
         "ticks": len(log.rows),
         "late_p99_ms": 1e3 * float(np.percentile(log.lateness or [0.0], 99)),
         "answered_p95_ms": 1e3 * float(np.percentile(log.answer_times or [0.0], 95)),
+        "observation_age_p95_ms": 1e3 * float(np.percentile(ages or [0.0], 95)),
         "force_max_newtons": float(max(forces, default=0.0)),
         "clamped": log.limit_counts,
         "arm_pace": log.arm_pace,
@@ -239,7 +241,8 @@ def report(result: Result, numbers: dict[str, Any], episodes: str) -> str:
     clamped = ", ".join(f"{name} {n}" for name, n in log.limit_counts.items()) or "never"
     lines = [
         f"{len(log.rows)} ticks of the control loop; 99 % began at most {numbers['late_p99_ms']:.1f} ms "
-        f"late, 95 % were answered within {numbers['answered_p95_ms']:.1f} ms",
+        f"late, 95 % were answered within {numbers['answered_p95_ms']:.1f} ms; 95 % of the observations "
+        f"were at most {numbers['observation_age_p95_ms']:.0f} ms old",
         f"largest force on the hand: {numbers['force_max_newtons']:.1f} N; commands limited: {clamped}",
     ]
     if log.arm_pace < SLOW_ARM:
