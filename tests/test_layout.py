@@ -50,6 +50,19 @@ def test_files_stay_small() -> None:
     assert not [str(p) for p in SOURCES if len(p.read_text().splitlines()) > 400]
 
 
+@pytest.mark.parametrize("path", [p for p in SOURCES if "fastmath" in p.read_text()], ids=str)
+def test_fast_math_calls_inlined_functions_alone(path: Path) -> None:
+    """Else the process that compiles them rounds otherwise than those that read them from the cache."""
+    found = [
+        node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)
+    ]
+    fast = {f for f in found if "fastmath" in "".join(map(ast.unparse, f.decorator_list))}
+    apart = {f.name for f in fast if "inline" not in "".join(map(ast.unparse, f.decorator_list))}
+    called = {node.func.id for f in fast for node in ast.walk(f)
+              if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}  # fmt: skip
+    assert apart and not called & apart
+
+
 def test_version_is_said_once() -> None:
     from touchgoal import __version__
 

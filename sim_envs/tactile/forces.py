@@ -99,7 +99,7 @@ def _match_moments(normal, pitch, place, mx, my):
             normal[i, j] *= 1.0 + share * (a * x + b * y)
 
 
-@njit(cache=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 @no_type_check
 def _bristles(normal, before, pitch, place, friction):
     """Return pressed cells (x, y from the centre, traction, friction limit), centre and load."""
@@ -132,7 +132,7 @@ def _bristles(normal, before, pitch, place, friction):
     return found, cx, cy, load
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")  # checks for zero prevent vectorisation
+@njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _brush_sums(bristles, stiffness, ux, uy, turn, total):
     """Sum force, torsion, and their derivatives, of bristles with moved tips."""
@@ -165,7 +165,7 @@ def _brush_sums(bristles, stiffness, ux, uy, turn, total):
     total[6], total[7], total[8] = k * hyy, k * hyt, k * htt
 
 
-@njit(cache=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 @no_type_check
 def _balance(bristles, stiffness, area, force_x, force_y, torsion):
     """Find the rigid motion (x, y, turn) of the tips that makes them carry force and torsion."""
@@ -200,7 +200,7 @@ def _balance(bristles, stiffness, area, force_x, force_y, torsion):
     return ux, uy, turn
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")  # checks for zero prevent vectorisation
 @no_type_check
 def _brush(normal, before, pitch, place, friction, stiffness, force, torque, out):
     """Write the tractions that balance force and torque to `out`."""

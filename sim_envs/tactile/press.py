@@ -97,7 +97,7 @@ def _shear(height, shift_x, shift_y, out):
             row[j] = (one - share) * left[j] + share * right[j]
 
 
-@njit(cache=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 @no_type_check
 def _overlap_sums(height, top, xs, pitch, shift, a, b, total):
     """Sum over the contact: 1, x, y, xx, xy, yy of its cells; overlap times 1, x, y."""
@@ -132,7 +132,7 @@ def _overlap_sums(height, top, xs, pitch, shift, a, b, total):
         total[8] += o * y
 
 
-@njit(cache=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 @no_type_check
 def _push(height, top, xs, pitch, volume, shift, a, b, most, tolerance, total):
     """Find the shift at which the overlap sums to `volume`, by Newton's method."""
