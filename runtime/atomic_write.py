@@ -14,12 +14,12 @@ _FULL = 1_000_000  # bytes free, below which a failed write is blamed on the dis
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary name to write to; move the file to `path` once it is on disk.
 
-    Its folder is made if needed. For two files, nest the blocks: the outer block's file is replaced
+    Two processes may write the same file at once; the last one stays. Its folder is made if needed. For two files, nest the blocks: the outer block's file is replaced
     last. A block that fails leaves the older file as it was. OSError, with the path, if it cannot be
     written, also where a library reports a full disk by an exception of its own.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".tmp")
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
         yield unfinished
         _sync(unfinished)

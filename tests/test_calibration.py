@@ -1,6 +1,7 @@
 """Calibration: known lights come back from presses, sensor files come back from disk."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -206,7 +207,7 @@ def test_shipped_sensor_files_fit_their_models(name: str) -> None:
 
 def test_a_press_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     """cv2.imwrite would return False, and the press would be lost without a word."""
-    (tmp_path / "press_00.png.tmp").mkdir()  # stands for a disk that takes no file
+    (tmp_path / f"press_00.png.{os.getpid()}.tmp").mkdir()  # stands for a disk that takes no file
     presses = replace(made_presses(known_sensor(), 1), files=("press_00.png",))
     with pytest.raises(OSError):
         write_presses(presses, tmp_path)

@@ -220,6 +220,21 @@ def test_a_full_disk_names_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert list(tmp_path.iterdir()) == []
 
 
+def test_two_processes_may_write_one_file_at_once(tmp_path: Path) -> None:
+    """As two trainings that embed the same demonstrations do."""
+    path = tmp_path / "embedding"
+    other = f"""
+from pathlib import Path
+from touchgoal.runtime.atomic_write import write_file
+write_file(Path({str(path)!r}), b"theirs")
+"""
+    with atomic_write(path) as unfinished:
+        unfinished.write_bytes(b"ours")
+        subprocess.run([sys.executable, "-c", other], check=True)
+        assert path.read_bytes() == b"theirs"
+    assert path.read_bytes() == b"ours" and list(tmp_path.iterdir()) == [path]
+
+
 def test_one_process_at_a_time_writes_into_a_folder(tmp_path: Path) -> None:
     open_run(tmp_path, "toy", Toy(out=tmp_path))
     line = [sys.executable, "-m", "touchgoal.launch", "twin", "--out", str(tmp_path)]
