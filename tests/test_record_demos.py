@@ -154,6 +154,8 @@ def test_the_hand_moves_as_asked_and_yields_to_what_it_presses_on() -> None:
     assert not still.any()
     moved, _, _ = act([0, 0, -0.2, 0, 0, 0], (0, 0, 10.0, 0, 0, 0))
     np.testing.assert_allclose(moved, [0, 0, TICK * (2e-3 * 7 - 0.02)], atol=1e-5)
+    _, turned, _ = act([0] * 6, (0, 0, 0, 0, 0, 0.5))
+    np.testing.assert_allclose(turned, [0, 0, TICK * 0.5 * 0.2], atol=1e-5)
 
 
 def test_a_policy_of_ones_own_task_yields_as_a_led_hand_does() -> None:
@@ -164,7 +166,7 @@ def test_a_policy_of_ones_own_task_yields_as_a_led_hand_does() -> None:
     kinematics, q = Kinematics(FR3.arm, FR3.tool.tcp_offset), FR3.arm.home
     hand = YieldingActor(Still(), ActionFilter(FR3, HZ), lambda: q)
     hand.start({ft.WRENCH: np.ones(6)})
-    assert not hand.act({ft.WRENCH: 1.0 + np.array([0, 0, 2.9, 0, 0, 0])})[:7].any()
+    assert not hand.act({ft.WRENCH: 1.0 + np.array([0, 0, 2.9, 0, 0, 0.5])})[:7].any()
     action = hand.act({ft.WRENCH: 1.0 + np.array([0, 0, 10.0, 0, 0, 0])})
     moved = kinematics.forward(q + action[:7])[0] - kinematics.forward(q)[0]
     np.testing.assert_allclose([*moved, action[7]], [0, 0, TICK * 4e-3 * 7, 0.05], atol=1e-5)

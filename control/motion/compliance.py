@@ -6,17 +6,18 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 
-# N and Nm beyond the first reading that count as none: the weight of a carried object, and the drift
-# of an arm's own estimate.
-_FREE_FORCE, _FREE_TORQUE = 3.0, 0.6
+_FREE_FORCE = 3.0  # N beyond the first reading that count as none: the weight of a carried object
 
 
 class Compliance:
     """Velocity with which the hand gives way to forces beyond those at rest."""
 
-    def __init__(self, force: float, torque: float) -> None:
-        """Take the speed per force, m/s per N, and per torque, rad/s per Nm."""
-        self._force, self._torque = force, torque
+    def __init__(self, force: float, torque: float, free_torque: float) -> None:
+        """Take the speed per force, m/s per N, and per torque, rad/s per Nm.
+
+        Torques up to `free_torque` (Nm) beyond the first reading count as none.
+        """
+        self._force, self._torque, self._free_torque = force, torque, free_torque
 
     def start(self, observation: Observation) -> None:
         """Take the wrench as that of the free hand."""
@@ -26,7 +27,7 @@ class Compliance:
         """Return the hand's velocity, base frame (m/s, rad/s); none where the wrench is unknown."""
         force, torque = (observation[ft.WRENCH] - self._at_rest).reshape(2, 3)
         moved = self._force * _beyond(force, _FREE_FORCE)
-        return np.concatenate([moved, self._torque * _beyond(torque, _FREE_TORQUE)])
+        return np.concatenate([moved, self._torque * _beyond(torque, self._free_torque)])
 
 
 def _beyond(vector: Float[np.ndarray, "3"], free: float) -> Float[np.ndarray, "3"]:

@@ -14,6 +14,8 @@ from touchgoal.control.teleoperation.config import TeleoperationConfig
 
 _MORE = 2  # times as much as a led hand: a policy sees where to stop less well than the person who led it
 
+_FREE_TORQUE = 0.6  # Nm; an arm's own estimate drifts, and the hand crept where nobody corrects it
+
 
 class YieldingActor(Actor):
     """Adds to another actor's actions the motion with which a hand yields, twice that of a led one.
@@ -28,7 +30,8 @@ class YieldingActor(Actor):
         hand = TeleoperationConfig()
         self._actor, self._commanded, self._dt = actor, commanded, safety.dt
         self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
-        self._compliance = Compliance(_MORE * hand.compliance, _MORE * hand.rotational_compliance)
+        more = _MORE * hand.compliance, _MORE * hand.rotational_compliance
+        self._compliance = Compliance(*more, _FREE_TORQUE)
 
     def start(self, observation: Observation) -> None:
         """See Actor; the first wrench is that of the free hand."""
