@@ -19,6 +19,7 @@ from touchgoal.launch.__main__ import main
 from touchgoal.rewards.report.frame_table import FRAMES
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import parallel_map
+from touchgoal.runtime.parallel.worker_pool import one_core_workers
 
 NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
 DEMOS = "collect-demos --episodes 4 --env.objects glass_ball --env.control-hz 10 --env.no-tactile"
@@ -82,6 +83,14 @@ def test_a_killed_process_loses_nothing(function: Callable[[int], Any]) -> None:
         multiprocessing.active_children()[0].kill()
         found = [first, *results]
     assert all(np.array_equal(f, function(i)) for i, f in enumerate(found)) and len(found) == 12
+
+
+@pytest.mark.parametrize("which", [0, 1])  # one of them keeps the queue of work locked
+def test_a_process_killed_while_it_waits_for_work_keeps_nobody_waiting(which: int) -> None:
+    with one_core_workers(2) as pool:
+        assert [pool.submit(abs, n).result() for n in range(12)] == [*range(12)]
+        multiprocessing.active_children()[which].kill()
+    assert not multiprocessing.active_children()
 
 
 def test_an_error_while_large_results_come_ends_the_workers() -> None:

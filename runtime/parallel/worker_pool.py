@@ -19,7 +19,8 @@ _LOOK = 1.0  # s between two looks at the workers
 class WorkerPool(ProcessPoolExecutor):
     """Processes of one core each; the death of one in the middle of a result is noticed, too.
 
-    Python's pool would wait for the rest of that result, because it holds the pipe's other end itself.
+    Python's pool would wait for the rest of that result, because it holds the pipe's other end itself; and
+    at its end for the others, because a worker that dies while it waits for work keeps the queue locked.
     """
 
     def __init__(self, workers: int) -> None:
@@ -33,8 +34,10 @@ class WorkerPool(ProcessPoolExecutor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """See Executor."""
-        self._ended.set()
-        super().shutdown(wait, cancel_futures=cancel_futures)
+        try:
+            super().shutdown(wait, cancel_futures=cancel_futures)
+        finally:
+            self._ended.set()
 
     def end_at_once(self) -> None:
         """Kill the workers and drop all work."""
