@@ -88,7 +88,7 @@ def test_a_killed_process_loses_nothing(function: Callable[[int], Any]) -> None:
 @pytest.mark.parametrize("which", [0, 1])  # one of them keeps the queue of work locked
 def test_a_process_killed_while_it_waits_for_work_keeps_nobody_waiting(which: int) -> None:
     with one_core_workers(2) as pool:
-        assert [pool.submit(abs, n).result() for n in range(12)] == [*range(12)]
+        assert [*pool.map(abs, range(12))] == [*range(12)]
         multiprocessing.active_children()[which].kill()
     assert not multiprocessing.active_children()
 
