@@ -52,10 +52,12 @@ class WorkerPool(ProcessPoolExecutor):
                 return
 
     def _kill(self) -> None:
+        results = self._result_queue  # the pool lets go of it once its workers have ended
         for worker in self._workers():
             worker.kill()
             worker.join()
-        self._result_queue._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
+        if results is not None:
+            results._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
 
     def _workers(self) -> list[BaseProcess]:
         """Return the workers; none before the first task and after the end."""
