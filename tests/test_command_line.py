@@ -221,7 +221,7 @@ def test_a_full_disk_names_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_two_processes_may_write_one_file_at_once(tmp_path: Path) -> None:
-    """As two trainings that embed the same demonstrations do."""
+    """Two trainings on the same demonstrations write the same cached embeddings."""
     path = tmp_path / "embedding"
     other = f"""
 from pathlib import Path

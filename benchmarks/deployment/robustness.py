@@ -23,7 +23,7 @@ _DELAYED = {  # state and pictures; at 20 Hz a tick is 50 ms; learned policies g
     f"{ticks} ticks late": {"state_delay": (s, s), "picture_delay": (s, s)}
     for ticks, s in ((2, 0.1), (4, 0.2))
 }
-_LONGER = 1.5  # times as long may an episode with late observations last
+_LONGER = 1.5  # factor on the time limit of an episode with late or frozen observations
 _FROZEN = {"every second picture frozen": {"picture_rate": 10.0}}
 _CHANGES: dict[SimulatedTask, dict[str, dict[str, Any]]] = {
     "pick-place": {

@@ -14,7 +14,8 @@ from touchgoal.control.teleoperation.config import TeleoperationConfig
 
 _MORE = 2  # times as much as a led hand: a policy sees where to stop less well than the person who led it
 
-_FREE_TORQUE = 0.6  # Nm; an arm's own estimate drifts, and the hand crept where nobody corrects it
+# Nm. More than for a led hand: a policy does not correct the slow turn that an estimate's drift causes.
+_FREE_TORQUE = 0.6
 
 
 class YieldingActor(Actor):
