@@ -172,7 +172,7 @@ def fit(
                     record.write(history, state)
                     line = training.progress(history[-1])
                     tqdm.write(f"epoch {epoch + 1}/{config.epochs}  {line}")
-                accelerator.wait_for_everyone()
+                _wait_for_everyone()
     finally:
         if record:
             record.close()
@@ -266,6 +266,11 @@ def on_first_process(action: Callable[[], object]) -> None:
     """Run `action` in the first of several processes, while the others wait."""
     if is_first_process():
         action()
+    _wait_for_everyone()
+
+
+def _wait_for_everyone() -> None:
+    """Wait for all processes; Accelerate's own wait wants a GPU for each, even of a training on CPUs."""
     if torch.distributed.is_initialized():
         torch.distributed.barrier()
 
