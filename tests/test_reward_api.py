@@ -64,6 +64,16 @@ def test_curve_of_arrays(encoder: TouchEncoder) -> None:
     assert third.costs["image"].argmin() == 3 and third.same_episode == {"image", "tactile"}
 
 
+@pytest.mark.gpu
+def test_a_gpu_gives_the_same_curves() -> None:
+    on_cpu, on_gpu = (
+        reward_curve(IMAGES, TOUCH, ("last", "a hard ball"), device=device).costs
+        for device in ("cpu", "cuda")
+    )
+    for name, cost in on_cpu.items():
+        assert on_gpu[name] == pytest.approx(cost, abs=1e-3)
+
+
 def test_goals_as_arrays_are_those_of_the_same_frame(encoder: TouchEncoder) -> None:
     both = {"encoder": encoder, "towers": PaintTowers()}
     frame = reward_curve(IMAGES, TOUCH, 9, **both)

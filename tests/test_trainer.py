@@ -72,7 +72,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import test_trainer
-test_trainer.train_everything(Path(sys.argv[1]))
+test_trainer.train_everything(Path(sys.argv[1]), sys.argv[2])
 """
 
 
@@ -148,29 +148,26 @@ def test_a_killed_training_ends_with_the_same_weights(name: str, tmp_path: Path)
     assert lines[0] == lines[1]
 
 
-def train_everything(out: Path) -> None:
+def train_everything(out: Path, device: str = "cpu") -> None:
     """Train by plain SGD: Adam would hide gradients that are twice too large."""
 
     def build(self: OptimizerConfig, module: nn.Module) -> torch.optim.Optimizer:
         return torch.optim.SGD(module.parameters(), self.lr)
 
+    torch.backends.cudnn.allow_tf32 = False  # on a GPU: no coarser than a CPU
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OptimizerConfig, "build", build)
-        for name, run in trainings().items():
+        for name, run in trainings(TrainerOptions(device=device)).items():
             torch.manual_seed(0)
             run(out / name)
 
 
-@pytest.fixture(scope="module")
-def two_runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Runs of every trainer in one process, and under torchrun in two."""
-    folder = tmp_path_factory.mktemp("runs")
+def train_apart(folder: Path, launcher: str, device: str) -> Path:
+    """Return the folder of runs of every trainer in a process of their own, or in several."""
     script, tests = folder / "worker.py", Path(__file__).parent
     script.write_text(WORKER.format(tests=str(tests)))
-    train_everything(folder / "1")
-    torchrun = "-W error::FutureWarning -m torch.distributed.run --standalone".split()
     done = subprocess.run(
-        [sys.executable, *torchrun, "--nproc-per-node=2", str(script), str(folder / "2")],
+        [sys.executable, *launcher.split(), str(script), str(folder / "runs"), device],
         env={
             **os.environ,
             "OMP_NUM_THREADS": "1",
@@ -181,14 +178,47 @@ def two_runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         stderr=subprocess.STDOUT,
     )
     assert done.returncode == 0, done.stdout.decode()[-9000:]
-    return folder / "1", folder / "2"
+    return folder / "runs"
+
+
+@pytest.fixture(scope="module")
+def one_process(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("one")
+    train_everything(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def two_processes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torchrun = "-W error::FutureWarning -m torch.distributed.run --standalone --nproc-per-node=2"
+    return train_apart(tmp_path_factory.mktemp("two"), torchrun, "cpu")
+
+
+@pytest.fixture(scope="module")
+def gpu(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train_apart(tmp_path_factory.mktemp("gpu"), "-W error::FutureWarning", "cuda")
+
+
+def same_training(name: str, one: Path, other: Path, loss: float, weights: float) -> None:
+    a, b = (
+        torch.load(run / name / "checkpoint.pt", map_location="cpu", weights_only=True)
+        for run in (one, other)
+    )
+    for left, right in zip(a["history"], b["history"], strict=True):
+        assert left["loss"] == pytest.approx(right["loss"], rel=loss)
+    for key, weight in a["model"].items():
+        torch.testing.assert_close(
+            b["model"][key], weight, rtol=10 * weights, atol=weights, msg=key
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TRAINERS)
-def test_two_processes_train_as_one(name: str, two_runs: tuple[Path, Path]) -> None:
-    one, two = (torch.load(run / name / "checkpoint.pt", weights_only=True) for run in two_runs)
-    for a, b in zip(one["history"], two["history"], strict=True):
-        assert a["loss"] == pytest.approx(b["loss"], rel=1e-5)
-    for key, weight in one["model"].items():
-        torch.testing.assert_close(two["model"][key], weight, rtol=1e-4, atol=1e-5, msg=key)
+def test_two_processes_train_as_one(name: str, one_process: Path, two_processes: Path) -> None:
+    same_training(name, one_process, two_processes, loss=1e-5, weights=1e-5)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", TRAINERS)
+def test_a_gpu_trains_as_the_cpu(name: str, one_process: Path, gpu: Path) -> None:
+    same_training(name, one_process, gpu, loss=1e-4, weights=1e-4)
