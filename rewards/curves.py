@@ -56,7 +56,8 @@ class Curves:
         goal: the goal of each modality in the form that a user writes.
         fps: frames per second.
         contact: first contact.
-        raw: cosine distance 1 - cos in [0, 2] per frame, by modality.
+        raw: cosine distance 1 - cos in [0, 2] per frame, by modality; touches shorter than 1 are
+            completed to that (see `complete`) unless a normalizer follows.
         normalised: distance in units of the normalizer (1 the usual start, 0 the usual end, below
             0 nearer than that), by modality; empty without one.
         parts: smoothed cost of each part and "fused" per frame, in [0, 1]; empty without a

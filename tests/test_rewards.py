@@ -145,6 +145,16 @@ def test_distances_by_hand() -> None:
     assert mean == pytest.approx((1 - np.cos(np.pi / 3)) / 2, abs=1e-6)
 
 
+def test_equal_touches_are_at_distance_0_faint_ones_too() -> None:
+    e = embedded("a")
+    assert e.touch is not None
+    for strength in (1.0, 0.5, 0.0):  # whitened embeddings are short, and 0 without contact
+        felt = replace(e, touch=np.float32(strength) * e.touch)
+        tactile = compute_curves(felt, goal_of(felt), None).raw["tactile"]
+        assert tactile[-1] == pytest.approx(0, abs=1e-6)
+        assert tactile[0] == pytest.approx(strength**2 * (1 - np.cos(np.pi / 3)), abs=1e-6)
+
+
 def test_scale_maps_the_usual_start_to_one_and_end_to_zero(tmp_path: Path) -> None:
     training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
     normalizer = fit_scene(training, ["image", "tactile"])

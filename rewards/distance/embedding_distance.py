@@ -51,6 +51,9 @@ def compute_curves(
     UserError: the normalizer lacks a modality or was fitted for something else.
     """
     raw = compute_distances(episode, goal)
+    if normalizer is None and goal.touch is not None:  # whose medians are of incomplete ones
+        touch, goals = complete(episode.touches()), complete(goal.touch)
+        raw["tactile"] = soft_minimum(touch_distances(touch, goals))
     same = goal.same_episode
     normalised, parts = {}, {}
     if normalizer is not None:
@@ -72,6 +75,16 @@ def compute_curves(
         parts,
         same.intersection(raw),
     )
+
+
+def complete(touch: Float32[np.ndarray, "*n k"]) -> Float32[np.ndarray, "*n k+1"]:
+    """Return embeddings completed to unit length by a coordinate of their own.
+
+    Whitened embeddings are as short as the touch is faint, and 0 without contact. Equal touches are
+    then at distance 0, untouched fingertips among them.
+    """
+    missing = 1 - np.square(touch).sum(-1, keepdims=True)
+    return np.concatenate([touch, np.sqrt(np.maximum(missing, 0))], -1)
 
 
 def touch_distances(
