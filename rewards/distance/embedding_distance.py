@@ -51,7 +51,7 @@ def compute_curves(
     UserError: the normalizer lacks a modality or was fitted for something else.
     """
     raw = compute_distances(episode, goal)
-    if normalizer is None and goal.touch is not None:  # whose medians are of incomplete ones
+    if normalizer is None and goal.touch is not None:  # normalizers were fitted on incomplete ones
         touch, goals = complete(episode.touches()), complete(goal.touch)
         raw["tactile"] = soft_minimum(touch_distances(touch, goals))
     same = goal.same_episode
