@@ -32,7 +32,10 @@ _CELL = ["--env.objects", "wooden_block", "--seed", "3", "--no-wrench-error"]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The slow ones first: at the end one of them would keep a single core busy for minutes."""
+    """The slow ones first: at the end one of them would keep a single core busy for minutes.
+
+    Without a GPU, what needs one is skipped.
+    """
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
     if not torch.cuda.is_available():
         for item in items:

@@ -118,7 +118,7 @@ def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
         assert floor - 1e-4 <= loss < floor + margin
     text = encoder.embed_text_goal(["a hard round ball", "a soft woven cloth"], PaintTowers())
     ball = encoder.embed_frames(touches.frames[1:2], touches.background[0])
-    assert (ball @ text[0]).item() > (ball @ text[1]).item() + 0.1
+    assert (ball @ text[0]).item() > (ball @ text[1]).item() + 0.2
 
 
 def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> None:

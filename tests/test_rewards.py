@@ -135,13 +135,13 @@ def test_each_modality_takes_the_first_goal_that_speaks_for_it() -> None:
 
 def test_distances_by_hand() -> None:
     e = embedded("a")
-    raw = compute_distances(e, goal_of(e))
+    raw = compute_distances(e, goal_of(e), completed=False)
     assert raw["image"][[0, -1]] == pytest.approx([1, 0], abs=1e-6)
     assert raw["tactile"][[0, -1]] == pytest.approx([1 - np.cos(np.pi / 3), 0], abs=1e-6)
     assert raw["text"] == pytest.approx(np.full(N, 1 - np.cos(np.pi / 6)), abs=1e-6)
     assert e.touch is not None
     one_hand = replace(e, touch=np.stack([e.touch[0], np.repeat(direction([90]), N, axis=0)]))
-    mean = compute_distances(one_hand, goal_of(e))["tactile"][-1]
+    mean = compute_distances(one_hand, goal_of(e), completed=False)["tactile"][-1]
     assert mean == pytest.approx((1 - np.cos(np.pi / 3)) / 2, abs=1e-6)
 
 
@@ -149,8 +149,8 @@ def test_equal_touches_are_at_distance_0_faint_ones_too() -> None:
     e = embedded("a")
     assert e.touch is not None
     for strength in (1.0, 0.5, 0.0):  # whitened embeddings are short, and 0 without contact
-        felt = replace(e, touch=np.float32(strength) * e.touch)
-        tactile = compute_curves(felt, goal_of(felt), None).raw["tactile"]
+        faint = replace(e, touch=np.float32(strength) * e.touch)
+        tactile = compute_curves(faint, goal_of(faint), None).raw["tactile"]
         assert tactile[-1] == pytest.approx(0, abs=1e-6)
         assert tactile[0] == pytest.approx(strength**2 * (1 - np.cos(np.pi / 3)), abs=1e-6)
 

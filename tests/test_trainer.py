@@ -199,26 +199,26 @@ def gpu(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train_apart(tmp_path_factory.mktemp("gpu"), "-W error::FutureWarning", "cuda")
 
 
-def same_training(name: str, one: Path, other: Path, loss: float, weights: float) -> None:
+def same_training(name: str, one: Path, other: Path, tolerance: float) -> None:
     a, b = (
         torch.load(run / name / "checkpoint.pt", map_location="cpu", weights_only=True)
         for run in (one, other)
     )
     for left, right in zip(a["history"], b["history"], strict=True):
-        assert left["loss"] == pytest.approx(right["loss"], rel=loss)
+        assert left["loss"] == pytest.approx(right["loss"], rel=tolerance)
     for key, weight in a["model"].items():
         torch.testing.assert_close(
-            b["model"][key], weight, rtol=10 * weights, atol=weights, msg=key
+            b["model"][key], weight, rtol=10 * tolerance, atol=tolerance, msg=f"{key}: {{}}".format
         )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TRAINERS)
 def test_two_processes_train_as_one(name: str, one_process: Path, two_processes: Path) -> None:
-    same_training(name, one_process, two_processes, loss=1e-5, weights=1e-5)
+    same_training(name, one_process, two_processes, tolerance=1e-5)
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", TRAINERS)
 def test_a_gpu_trains_as_the_cpu(name: str, one_process: Path, gpu: Path) -> None:
-    same_training(name, one_process, gpu, loss=1e-4, weights=1e-4)
+    same_training(name, one_process, gpu, tolerance=1e-4)

@@ -25,14 +25,20 @@ _ALPHA = 0.5  # share of the way to the line through baseline and sentence
 
 
 def compute_distances(
-    episode: EmbeddedEpisode, goal: EmbeddedGoal
+    episode: EmbeddedEpisode, goal: EmbeddedGoal, completed: bool
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return the raw cosine distance per frame, for each modality that has a goal."""
+    """Return the raw cosine distance per frame, for each modality that has a goal.
+
+    With `completed`, touch is completed to unit length first (see `complete`).
+    """
     raw = {}
     if goal.image is not None:
         raw["image"] = soft_minimum(cosine_distances(episode.pictures(), goal.image))
     if goal.touch is not None:
-        raw["tactile"] = soft_minimum(touch_distances(episode.touches(), goal.touch))
+        touch, goals = episode.touches(), goal.touch
+        if completed:
+            touch, goals = complete(touch), complete(goals)
+        raw["tactile"] = soft_minimum(touch_distances(touch, goals))
     if goal.text is not None:
         raw["text"] = soft_minimum(text_distances(episode.touches(), goal.text, goal.text_baseline))
     return raw
@@ -50,10 +56,8 @@ def compute_curves(
     `before` holds the costs of the parts at the previous frame, if the trajectory comes in pieces.
     UserError: the normalizer lacks a modality or was fitted for something else.
     """
-    raw = compute_distances(episode, goal)
-    if normalizer is None and goal.touch is not None:  # normalizers were fitted on incomplete ones
-        touch, goals = complete(episode.touches()), complete(goal.touch)
-        raw["tactile"] = soft_minimum(touch_distances(touch, goals))
+    # normalizers were fitted on the distances of incomplete touches
+    raw = compute_distances(episode, goal, completed=normalizer is None)
     same = goal.same_episode
     normalised, parts = {}, {}
     if normalizer is not None:
