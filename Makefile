@@ -121,7 +121,7 @@ fragile-carry: $(READY)
 	$(BIN)/touchgoal $(CARRY) --out runs/fragile/state
 	$(BIN)/touchgoal $(CARRY) --hand-force --out runs/fragile/force
 	$(BIN)/touchgoal $(CARRY) $(TOUCH) --cameras front wrist --out runs/fragile/both
-	$(BIN)/touchgoal benchmark fragile-carry \
+	$(BIN)/python -m benchmarks fragile-carry \
 		--policies $(foreach inputs,touch both sight force state,runs/fragile/$(inputs)/policy)
 
 pick-place-policy: $(READY)

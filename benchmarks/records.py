@@ -1,9 +1,9 @@
 """Records of measured figures: the command, what it printed, and its metrics.
 
-    python -m touchgoal.benchmarks.records measure NAME ...   # run the command of a record, write it
-    python -m touchgoal.benchmarks.records                    # rewrite the tables of README and docs
+    python -m benchmarks.records measure NAME ...   # run the command of a record, write it
+    python -m benchmarks.records                    # rewrite the tables of README and docs
 
-A record is `benchmarks/results/NAME.json`. An installed package has the records but no pages.
+A record is `benchmarks/results/NAME.json`.
 """
 
 import json
@@ -17,7 +17,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from touchgoal.benchmarks import figures
+from benchmarks import figures
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import hardware
 
@@ -51,7 +51,7 @@ def load_record(name: str) -> dict[str, Any]:
 
 def records_of(benchmark: str) -> list[str]:
     """Return the names of a benchmark's records, or a record's own name; UserError if none."""
-    start = f"touchgoal benchmark {benchmark} "
+    start = f"python -m benchmarks {benchmark} "
     names = [name for name, quoted in QUOTED.items() if f"{quoted.command} ".startswith(start)]
     if benchmark in QUOTED and benchmark not in names:
         names.insert(0, benchmark)
@@ -89,7 +89,9 @@ def measure(name: str) -> None:
     if name not in QUOTED:
         raise UserError(f"there is no record {name!r}; choose from: {', '.join(QUOTED)}")
     command, out = QUOTED[name].command, ROOT / "runs" / "results" / name
-    program = [sys.executable, "-m", "touchgoal.launch", *shlex.split(command)[1:]]
+    words = shlex.split(command.removeprefix("python -m "))
+    module = {"touchgoal": "touchgoal.launch"}.get(words[0], words[0])
+    program = [sys.executable, "-m", module, *words[1:]]
     printed = subprocess.check_output([*program, "--out", str(out)], text=True)
     lines = [line.rstrip() for line in printed.splitlines()]
     table = [x for x in lines if not (str(out) in x or x.startswith("hardware: "))]
@@ -131,7 +133,7 @@ def _table(names: list[str]) -> str:
 def main(arguments: list[str]) -> None:
     """Measure the named records, then rewrite every page."""
     if arguments and arguments[0] != "measure":
-        raise UserError("usage: python -m touchgoal.benchmarks.records [measure NAME ...]")
+        raise UserError("usage: python -m benchmarks.records [measure NAME ...]")
     for name in arguments[1:]:
         measure(name)
     for page in pages():

@@ -1,26 +1,19 @@
 """The `touchgoal` command: `touchgoal COMMAND --help`."""
 
-import errno
 import importlib
-import io
 import os
-import select
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Any
 
 from touchgoal import __version__
-from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.interruption import Terminated, terminable
-from touchgoal.runtime.run_folder import check_writable, release_runs
+from touchgoal.launch.support.process import run_command, standard_streams
+from touchgoal.runtime.run_folder import check_writable
 
 COMMANDS = {
     "demo": "pick an object up and place it in simulation, and draw its distance to the goal",
     "doctor": "what this machine can do, and how to install what is missing",
-    "list": "objects, sensors, tasks, policies, encoders and benchmarks by name",
+    "list": "objects, sensors, tasks, policies and encoders by name",
     "collect-demos": "record an expert's episodes of a task, or failures on purpose",
     "collect-touches": "record touches of objects: the MMWand data set, or slides to learn from without labels",
     "record-demos": "lead an arm or the twin by SpaceMouse or keys, and record demonstrations",
@@ -42,15 +35,7 @@ COMMANDS = {
     "push": "upload an encoder or a policy to the Hugging Face Hub",
     "pull": "download one from the Hugging Face Hub and check it",
     "repair": "check a set of episodes and mend what an interruption left",
-    "benchmark": "print one table of measured figures",
     "completion": "print a script that completes commands and options in a shell",
-}
-
-_WRITE_ERRORS = {  # errno -> advice
-    **dict.fromkeys((errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM), ""),
-    **dict.fromkeys((errno.ENAMETOOLONG, errno.ELOOP), ""),
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), ": free some space and run the command again"),
-    errno.EMFILE: ": raise the limit with ulimit -n",
 }
 
 
@@ -66,15 +51,12 @@ def usage() -> str:
 def main(argv: list[str] | None = None) -> None:
     """Run one command.
 
-    Exit status: 1 after a user's mistake or a failed write, in one line on stderr (2 if tyro finds
-    it), 130 after Ctrl-C and 143 after SIGTERM, 141 where the reader of stdout has gone
-    (`touchgoal list | head -1`).
+    Exit status: see `run_command`; 141 where the reader of stdout has gone (`touchgoal list | head -1`).
     """
     if argv is None:  # this process is the command: OpenCV reads the variable when it is imported
         # s until a silent V4L2 camera is given up; the default, 10, delays its reopening.
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
-    _prepare_streams()
-    with _until_reader_leaves():
+    with standard_streams():
         _main(sys.argv[1:] if argv is None else argv)
 
 
@@ -86,47 +68,12 @@ def _main(arguments: list[str]) -> None:
     elif arguments[0] not in COMMANDS:
         sys.exit(_unknown(arguments[0]))
     else:
-        with _recorded_as(arguments), terminable():
-            _run(*arguments)
+        run_command("touchgoal", arguments, _run)
 
 
 def _run(name: str, *options: str) -> None:
-    prog = f"touchgoal {name}"
-    try:
-        _require_working_directory()
-        module, config = read_options(name, list(options))
-        module.main(config)
-    except UserError as error:
-        sys.exit(f"{prog}: {error}")
-    except OSError as error:
-        if error.errno not in _WRITE_ERRORS:
-            raise
-        where = f"{error.filename}: " if error.filename else ""
-        sys.exit(f"{prog}: {where}{os.strerror(error.errno)}{_WRITE_ERRORS[error.errno]}")
-    except KeyboardInterrupt as interruption:
-        stopped = "; ".join(["stopped", *getattr(interruption, "__notes__", [])])
-        print(f"\n{prog}: {stopped}", file=sys.stderr)
-        stopped_by = signal.SIGTERM if isinstance(interruption, Terminated) else signal.SIGINT
-        sys.exit(128 + stopped_by)
-    finally:
-        release_runs()
-
-
-def _require_working_directory() -> None:
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        raise UserError("the working directory is gone: change to one that exists") from None
-
-
-def _prepare_streams() -> None:
-    """Open streams that were closed at the start; escape what a terminal's encoding lacks."""
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+    module, config = read_options(name, list(options))
+    module.main(config)
 
 
 def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
@@ -134,12 +81,8 @@ def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
     from touchgoal.launch.support.command_line import parse
 
     module = importlib.import_module(f"touchgoal.launch.{name.replace('-', '_')}")
-    chosen, prog = module, f"touchgoal {name}"
-    if hasattr(module, "choose"):  # a command with subcommands: benchmark NAME
-        prog = " ".join([prog, *options[:1]])
-        chosen, options = module.choose(options)
-    envs = getattr(chosen, "ENVS", None)
-    config = parse(chosen.Config, options, prog, chosen.__doc__ or "", envs)
+    envs = getattr(module, "ENVS", None)
+    config = parse(module.Config, options, f"touchgoal {name}", module.__doc__ or "", envs)
     if hasattr(config, "out"):
         check_writable(config.out)
     return module, config
@@ -151,34 +94,6 @@ def _unknown(name: str) -> str:
     meant = [command for command in COMMANDS if close and command.startswith(close[0])]
     guess = f"; did you mean {' or '.join(meant)}?" if meant else ""
     return f"touchgoal: there is no command {name!r}{guess}\n\n{usage()}"
-
-
-@contextmanager
-def _until_reader_leaves() -> Iterator[None]:
-    try:
-        try:
-            yield
-        finally:
-            sys.stdout.flush()
-    except BrokenPipeError:
-        stdout = select.poll()
-        stdout.register(sys.stdout.fileno(), 0)
-        if not any(event & select.POLLERR for _, event in stdout.poll(0)):
-            raise  # not stdout's pipe
-        # The rest of the buffer would fail again at the interpreter's end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(128 + signal.SIGPIPE)
-
-
-@contextmanager
-def _recorded_as(arguments: list[str]) -> Iterator[None]:
-    """Make `arguments` the command that the run's record names."""
-    before = sys.argv
-    sys.argv = ["touchgoal", *arguments]
-    try:
-        yield
-    finally:
-        sys.argv = before
 
 
 if __name__ == "__main__":

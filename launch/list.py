@@ -1,4 +1,4 @@
-"""List objects, sensors, tasks, policies, encoders or benchmarks by name."""
+"""List objects, sensors, tasks, policies or encoders by name."""
 
 import json
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from touchgoal.policies.config import POLICIES
 from touchgoal.runtime.option_types import checked_dataclass
 
 _WEIGHTS = Path(touchgoal.__file__).parent / "encoders" / "weights"
-Kind = Literal["objects", "sensors", "tasks", "policies", "encoders", "benchmarks"]
+Kind = Literal["objects", "sensors", "tasks", "policies", "encoders"]
 TASKS = {
     "pick-place": "pick an object up and place it on a disc",
     "bead-maze": "lead a bead along a bent wire by touch",
@@ -70,17 +70,10 @@ def _encoders() -> dict[str, str]:
     return found
 
 
-def _benchmarks() -> dict[str, str]:
-    from touchgoal.launch.benchmark import BENCHMARKS
-
-    return {name: meaning for name, (_, meaning) in BENCHMARKS.items()}
-
-
 KINDS: dict[Kind, tuple[Callable[[], dict[str, str]], str]] = {
     "objects": (_objects, "--env.objects NAME"),
     "sensors": (_sensors, "--env.sensor NAME"),
     "tasks": (lambda: TASKS, "--task NAME"),
     "policies": (lambda: POLICIES | OWN_POLICIES, "--policy NAME"),
     "encoders": (_encoders, "--encoder NAME"),
-    "benchmarks": (_benchmarks, "touchgoal benchmark NAME"),
 }

@@ -12,13 +12,13 @@ from typing import Any
 
 from touchgoal import __version__
 
-_PROGRAM = "touchgoal"
+_PROGRAMS = ("touchgoal ", "python -m benchmarks ")
 _PACKAGES = ("numpy", "torch", "mujoco", "opencv-contrib-python-headless")
 
 
 def command_line() -> str:
     """Return the running command as it can be typed again."""
-    return shlex.join([_PROGRAM, *sys.argv[1:]])
+    return f"{sys.argv[0]} {shlex.join(sys.argv[1:])}".strip()
 
 
 def portable(record: Any) -> Any:
@@ -34,7 +34,7 @@ def portable(record: Any) -> Any:
             return [portable(value) for value in record]
         case Path():
             return portable(str(record))
-        case str() if record.startswith(f"{_PROGRAM} "):
+        case str() if record.startswith(_PROGRAMS):
             return shlex.join(map(_portable_path, shlex.split(record)))
         case str():
             return _portable_path(record)

@@ -11,7 +11,9 @@ from pathlib import Path
 
 from in_process import in_process_workers
 
-from touchgoal.launch.__main__ import main
+from benchmarks import __main__ as benchmarks
+from benchmarks.records import records_of
+from touchgoal.launch import __main__ as launch
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -48,10 +50,12 @@ NOT_RUN = {
     "arm": "needs an arm: test_deploy.py",
     "push": "needs a hub: test_hub.py",
     "pull": "needs a hub: test_hub.py",
-    "benchmark": "test_commands.py runs each at toy size",
     "make-policy": "test_commands.py",
     "demo": "test_commands.py",
 }
+
+
+STARTS = ("touchgoal ", "python -m benchmarks ", "launch/deploy.sh", "make ")
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ class Command:
 
     @property
     def words(self) -> list[str]:
-        return shlex.split(self.line)
+        return shlex.split(self.line.removeprefix("python -m "))
 
     @property
     def small(self) -> list[str]:
@@ -88,7 +92,7 @@ def commands() -> Iterator[Command]:
     for page in PAGES:
         text = page.read_text()
         for line, whole in _lines(text):
-            if line not in met and line.split()[0] in ("touchgoal", "launch/deploy.sh", "make"):
+            if line not in met and line.startswith(STARTS):
                 met.add(line)
                 yield Command(page.name, line, whole)
 
@@ -98,7 +102,7 @@ def exit_status(words: list[str]) -> int:
     print("touchgoal", shlex.join(words), flush=True)
     try:
         with in_process_workers():
-            main(words)
+            launch.main(words)
     except SystemExit as end:
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)
@@ -114,11 +118,11 @@ def _lines(text: str) -> Iterator[tuple[str, bool]]:
                 if command := re.sub(r"\s+#.*", "", line).strip():
                     yield command, True
     prose = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
-    for line in re.findall(r"^    (touchgoal .*?)(?:\s+#.*)?$", prose, re.MULTILINE):
+    for line in re.findall(r"^    ((?:touchgoal|python -m) .*?)(?:\s+#.*)?$", prose, re.MULTILINE):
         yield line, False
     for span in re.finditer(r"`([^`]+)`", prose):
         line = " ".join(span[1].split())
-        if re.match(r"(touchgoal [a-z]|launch/deploy\.sh|make [a-z])", line):
+        if line.startswith(STARTS) and not line.startswith("touchgoal --"):
             yield line, False
 
 
@@ -133,5 +137,15 @@ def recipes(target: str) -> list[list[str]]:
     output = subprocess.run(asked, check=True, capture_output=True, text=True).stdout
     output = re.sub(r"\$\(\(.*?\)\)", "1", output.replace("\\\n", " "))
     output = re.sub(r"\$\{?round\}?", "1", output)
-    found = re.findall(r"\.venv/bin/touchgoal ([^;&|\n]*)", output)
+    found = re.findall(r"\.venv/bin/(?:touchgoal|python -m (?=benchmarks)) ?([^;&|\n]*)", output)
     return [shlex.split(line) for line in found]
+
+
+def read_options(words: list[str]) -> None:
+    """Parse the words of a command: after `touchgoal`, or from `benchmarks` on."""
+    if words[0] != "benchmarks":
+        launch.read_options(words[0], words[1:])
+    elif "--recorded" in words:
+        assert records_of(words[1])
+    else:
+        benchmarks.read_options(words[1], words[2:])

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.__main__ import main as benchmarks_main
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.parallel import worker_pool
 
@@ -38,3 +39,7 @@ def in_process_workers() -> Iterator[None]:
 
 def run(*arguments: object) -> None:
     main([str(a) for a in arguments])
+
+
+def run_benchmark(*arguments: object) -> None:
+    benchmarks_main([str(a) for a in arguments])

@@ -7,11 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from in_process import in_process_workers, run
+from in_process import in_process_workers, run, run_benchmark
 from toy_episodes import record
 
-from touchgoal.benchmarks.papers import mixed_demonstrations, reward_use
-from touchgoal.benchmarks.papers.reward_quality import benchmark, recording
+from benchmarks.papers import mixed_demonstrations, reward_use
+from benchmarks.papers.reward_quality import benchmark, recording
 from touchgoal.control import features as ft
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
@@ -121,21 +121,21 @@ def test_learning_the_bead_maze(here: Path, capsys: pytest.CaptureFixture) -> No
     run("run-policy", "--task", "bead-maze", "--policy", "policy/policy", "--episodes", 1, *one,
         "--env.deployment.plan-ticks", 2, "--no-video", "--env.max-seconds", 1)  # fmt: skip
     assert "0/1" in capsys.readouterr().out
-    run("benchmark", "bead-maze", "--policies", "policy/policy", "--wires", 1, "--held-out", 0,
+    run_benchmark("bead-maze", "--policies", "policy/policy", "--wires", 1, "--held-out", 0,
         "--demonstrations", 2, "--plan-ticks", "--env.max-seconds", 3, *one)  # fmt: skip
     printed = capsys.readouterr().out
     assert "frozen touch (mae), 1 demos, shuffled" in printed and "zero motion" in printed
-    run("benchmark", "task-ceilings", "--data", "demos/episodes")
+    run_benchmark("task-ceilings", "--data", "demos/episodes")
     assert "safety.indentation" in capsys.readouterr().out
-    run("benchmark", "policy-delay", "--policy", "expert", "--episodes", 1, "--delay", 0, "--jitter", 0, "--rates",
+    run_benchmark("policy-delay", "--policy", "expert", "--episodes", 1, "--delay", 0, "--jitter", 0, "--rates",
         30, "--workers", 1, "--out", "delay")  # fmt: skip
-    run("benchmark", "robustness", "--policy", "expert", "--tasks", "pick-place",
+    run_benchmark("robustness", "--policy", "expert", "--tasks", "pick-place",
         "--changes", "light +10%", "2 ticks late", "--episodes", 1, "--workers", 1)  # fmt: skip
     printed = capsys.readouterr().out
     assert "pick-place, light +10%" in printed and "pick-place, 2 ticks late" in printed
-    run("benchmark", "audit", "--policy", "expert", "--tasks", "pick-place", "--episodes", 1, *one)
+    run_benchmark("audit", "--policy", "expert", "--tasks", "pick-place", "--episodes", 1, *one)
     assert "pick-place, arm's state of another episode" in capsys.readouterr().out
-    run("benchmark", "policy-latency", "--policy", "policy/policy", "--repeats", 3,
+    run_benchmark("policy-latency", "--policy", "policy/policy", "--repeats", 3,
         "--large-repeats", 0)  # fmt: skip
     assert "denoising" in capsys.readouterr().out
     run("train-policy", "--preset", "paper", *both, *one, "--head", "tiny", "--sampler.num-inference-steps", 2, "--trials", 0,
@@ -210,7 +210,7 @@ def test_a_shipped_policy_is_made_by_one_command(here: Path, capsys: pytest.Capt
 
 def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     run("doctor")
-    run(*"benchmark env-speed --repeats 1 --physics-steps 100 --env-steps 1".split(), "--out",
+    run_benchmark(*"env-speed --repeats 1 --physics-steps 100 --env-steps 1".split(), "--out",
         tmp_path)  # fmt: skip
     printed = capsys.readouterr().out
     assert "MISSING" not in printed and "two tactile + one 128x128 camera" in printed
@@ -234,8 +234,8 @@ def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(benchmark, "KINDS", kinds)
     monkeypatch.setattr(benchmark, "TRUE_KINDS", kinds[:-1])
     sizes = "--episodes 1 --suboptimal 1 --successes 2 --training 4 --goals 1 --calibration 9"
-    words = f"benchmark reward-quality {sizes} --scenes fixed --every 2 --env.control-hz 5"
-    run(*words.split(), "--env.camera-size", 64, 64, "--out", tmp_path)
+    words = f"reward-quality {sizes} --scenes fixed --every 2 --env.control-hz 5"
+    run_benchmark(*words.split(), "--env.camera-size", 64, 64, "--out", tmp_path)
     result = json.loads((tmp_path / "metrics.json").read_text())["scenes"]["fixed"]
     assert set(result["auc"]) == {*kinds, "mean of true kinds"}
     assert result["episodes"] == dict.fromkeys(outcomes, 1) | {"success": 2}
@@ -247,9 +247,9 @@ def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_benchmark_reward_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reward_use, "_TASK", PickPlaceConfig(objects=("brick",), max_seconds=1))
     sizes = "--training 4 --goals 1 --demonstrations 4 --validation 1 --seeds 1 --trials 1"
-    words = f"benchmark reward-use {sizes} --checkpoints 1 --rollouts 1 --train.epochs 1"
+    words = f"reward-use {sizes} --checkpoints 1 --rollouts 1 --train.epochs 1"
     rows = ("--weights", "none", "fused")
-    run(*words.split(), *rows, "--env.camera-size", 64, 64, "--out", tmp_path)
+    run_benchmark(*words.split(), *rows, "--env.camera-size", 64, 64, "--out", tmp_path)
     used = json.loads((tmp_path / "metrics.json").read_text())
     assert used["imitation"]["none"][0]["used"] == 1 > used["imitation"]["fused"][0]["used"]
     assert len(used["checkpoints"]) == 1
@@ -258,7 +258,7 @@ def test_benchmark_reward_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.slow
 def test_grasps_are_found_by_trial(tmp_path: Path) -> None:
     sizes = "--scenes 1 --rounds 1 --samples 6 --goals 1 --error 0.01 --env.control-hz 10"
-    run("benchmark", "grasp-search", *sizes.split(), "--out", tmp_path)
+    run_benchmark("grasp-search", *sizes.split(), "--out", tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text())["lifted"]["fused"] == [True]
 
 
@@ -277,7 +277,7 @@ def test_encoder_speed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     pair = replace(PRESETS["tiny"], channels=6)
     backbone = TouchBackbone(TouchBackboneConfig.for_sensor(pair, "gelsight_mini", 2))
     pretrained.save(backbone, tmp_path / "pair", {})
-    run("benchmark", "encoder-speed", "--encoders", tmp_path / "pair", "gelsight_mini", "--shapes",
+    run_benchmark("encoder-speed", "--encoders", tmp_path / "pair", "gelsight_mini", "--shapes",
         "mae-tiny", "--batch-size", 2, "--repeats", 1, "--ticks", 1, "--out", tmp_path / "run")  # fmt: skip
     printed = capsys.readouterr().out
     assert "Sparsh mae-tiny, random" in printed

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from in_process import run
+from in_process import run, run_benchmark
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.recording import EpisodeSpec, record_episode
@@ -65,7 +65,7 @@ def test_commands_from_demonstrations_to_a_table(tmp_path: Path, capsys) -> None
     run("train-policy", "--data", data / "episodes", "--validation", val / "episodes", "--out", policy,
         "--head", "regression", "--representation", "base_twist", "--hand-force", "--train.epochs", 1,
         "--trials", 0, *one)  # fmt: skip
-    run("benchmark", "fragile-carry", "--policies", policy / "policy", "--episodes", 1, "--env.max-seconds", 1,
+    run_benchmark("fragile-carry", "--policies", policy / "policy", "--episodes", 1, "--env.max-seconds", 1,
         *one, "--out", tmp_path / "table")  # fmt: skip
     printed = capsys.readouterr().out
     assert re.search("^state, force on the hand +0/1 ", printed, re.M)

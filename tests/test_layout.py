@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = "runtime control sim_envs episodes encoders rewards policies benchmarks launch"
+FOLDERS = "runtime control sim_envs episodes encoders rewards policies launch"
 ORDER: list[str] = [*FOLDERS.split()]
 SOURCES = sorted(p for f in ORDER for p in (ROOT / f).rglob("*.py"))
 FORBIDDEN = {"rewards": {"policies"}, "policies": {"rewards"}}

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from in_process import run_benchmark
 from running_twin import RunningTwin
 
-from touchgoal.benchmarks.deployment.replay import replay_both
+from benchmarks.deployment.replay import replay_both
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.cell_file import EXAMPLES
@@ -85,8 +86,8 @@ def test_a_lock_step_cell_without_a_twin_is_one_line(address: str) -> None:
 @pytest.mark.slow
 def test_benchmark_deploy_counts_what_deploy_did(tmp_path: Path) -> None:
     """The maze's example file, without a twin; half a second does not reach the wire's end."""
-    run = "benchmark deploy --tasks bead-maze --policies scripted --episodes 1".split()
-    main([*run, "--arms", "in-process", "--seconds", "0.5", "--out", str(tmp_path / "run")])
+    run = "deploy --tasks bead-maze --policies scripted --episodes 1".split()
+    run_benchmark(*run, "--arms", "in-process", "--seconds", "0.5", "--out", str(tmp_path / "run"))
     done = json.loads((tmp_path / "run" / "metrics.json").read_text())["deployments"]
     assert len(done) == 1 and done[0]["policy"] == "follower" and not done[0]["success"]
     assert "time is up" in done[0]["ending"] and done[0]["progress"] < 0.2

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from touchgoal.benchmarks.real_touch import forces, markers
-from touchgoal.benchmarks.real_touch.embedders import find_embedder
-from touchgoal.benchmarks.real_touch.videos import Config, run
+from benchmarks.real_touch import forces, markers
+from benchmarks.real_touch.embedders import find_embedder
+from benchmarks.real_touch.videos import Config, run
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes import property_probe

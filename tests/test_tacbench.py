@@ -9,13 +9,13 @@ import torch
 from in_process import in_process_workers
 from published_files import write_force_batch
 
-from touchgoal.benchmarks.papers.tacbench.benchmark import run
-from touchgoal.benchmarks.papers.tacbench.config import Config
-from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, read_strokes
-from touchgoal.benchmarks.papers.tacbench.force import field_metrics, force_metrics
-from touchgoal.benchmarks.papers.tacbench.labels import label_metrics
-from touchgoal.benchmarks.papers.tacbench.slip import f1_score, slip_metrics
-from touchgoal.benchmarks.papers.tacbench.task import split_force, split_slip
+from benchmarks.papers.tacbench.benchmark import run
+from benchmarks.papers.tacbench.config import Config
+from benchmarks.papers.tacbench.data import STRIDE, RigFrames, read_strokes
+from benchmarks.papers.tacbench.force import field_metrics, force_metrics
+from benchmarks.papers.tacbench.labels import label_metrics
+from benchmarks.papers.tacbench.slip import f1_score, slip_metrics
+from benchmarks.papers.tacbench.task import split_force, split_slip
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig

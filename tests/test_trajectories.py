@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from touchgoal.benchmarks.deployment.sent_stream import late_by, outside_box, send, wild_commands
+from benchmarks.deployment.sent_stream import late_by, outside_box, send, wild_commands
 from touchgoal.control.motion.arm_models import UR5E_ARM, JointLimits
 from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics
 from touchgoal.control.motion.rotations import fingers_down

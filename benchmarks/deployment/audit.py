@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.benchmarks.deployment.trials import TABLE_HEAD, UNCHANGED, DeployedOptions, table_row
+from benchmarks.deployment.trials import TABLE_HEAD, UNCHANGED, DeployedOptions, table_row
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.episodes.recording import Actor, EpisodeSpec

@@ -16,13 +16,13 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from touchgoal.benchmarks.deployment.deployed_episode import (
+from benchmarks.deployment.deployed_episode import (
     Deployment,
     Scene,
     deploy,
     deployed_twin,
 )
-from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.episodes.recording import EpisodeSpec

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.benchmarks.deployment.deployed_episode import own_address
-from touchgoal.benchmarks.options import BenchmarkOptions
+from benchmarks.deployment.deployed_episode import own_address
+from benchmarks.options import BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig

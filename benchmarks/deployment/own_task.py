@@ -12,14 +12,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from touchgoal.benchmarks.deployment.deployed_episode import (
+from benchmarks.deployment.deployed_episode import (
     REFUSED,
     Deployment,
     Scene,
     deploy,
     deployed_twin,
 )
-from touchgoal.benchmarks.options import BenchmarkOptions
+from benchmarks.options import BenchmarkOptions
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.episodes.store import EpisodeSet

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from touchgoal.benchmarks.deployment.trials import TrialOptions, try_cases
+from benchmarks.deployment.trials import TrialOptions, try_cases
 from touchgoal.runtime.option_types import NotNegative, Positive, checked_dataclass
 from touchgoal.sim_envs.cell.deployment import AS_DEPLOYED, IDEAL_DEPLOYMENT, DeploymentConfig
 from touchgoal.sim_envs.config import ENVS, TaskName

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.benchmarks.deployment.deployed_episode import Scene, deployed_twin
-from touchgoal.benchmarks.options import BenchmarkOptions
+from benchmarks.deployment.deployed_episode import Scene, deployed_twin
+from benchmarks.options import BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.config import CellConfig

@@ -7,7 +7,7 @@ it: `--policy expert`, `--policy follower`.
 from dataclasses import replace
 from typing import Any
 
-from touchgoal.benchmarks.deployment.trials import UNCHANGED, DeployedOptions, try_cases
+from benchmarks.deployment.trials import UNCHANGED, DeployedOptions, try_cases
 from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass

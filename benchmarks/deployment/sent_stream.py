@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from touchgoal.benchmarks.options import BenchmarkOptions
+from benchmarks.options import BenchmarkOptions
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker
 from touchgoal.control.safety.action_filter import ActionFilter

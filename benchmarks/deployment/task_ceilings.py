@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.benchmarks.options import BenchmarkOptions
+from benchmarks.options import BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.control.safety.limits import TaskForces
 from touchgoal.control.tactile.indentation import IndentationMeter

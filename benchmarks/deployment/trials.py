@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.policies.by_name import choose_policy
 from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 
-from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.features import Observation
 from touchgoal.encoders.backbones.sparsh import Method
 from touchgoal.encoders.pretrained import ENCODER_FORMAT

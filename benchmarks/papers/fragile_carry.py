@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.policies.by_name import PolicyMaker, prepare_policy

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from touchgoal.benchmarks.options import CORES, BenchmarkOptions
-from touchgoal.benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
+from benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
 from touchgoal.control.features import CAMERAS, TACTILE, WRENCH, Observation
 from touchgoal.episodes.schema import Episode
 from touchgoal.policies.evaluation.success_rate import SuccessRate

@@ -7,8 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
-from touchgoal.benchmarks.papers.reward_quality.recording import Recorded
+from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
+from benchmarks.papers.reward_quality.recording import Recorded
 from touchgoal.control.features import Observation
 from touchgoal.episodes.recording import EpisodeSpec, collect, missing_specs
 from touchgoal.episodes.store import EpisodeSet

@@ -15,12 +15,12 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.stats import spearmanr
 
-from touchgoal.benchmarks.options import CORES, BenchmarkOptions
-from touchgoal.benchmarks.papers.mixed_demonstrations import record_mixed, record_right
-from touchgoal.benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
-from touchgoal.benchmarks.papers.reward_quality.embedding import EmbeddedFiles
-from touchgoal.benchmarks.papers.reward_quality.judging import Judge, fit_judge
-from touchgoal.benchmarks.papers.reward_quality.recording import Recorded, Sizes, plan, record
+from benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.papers.mixed_demonstrations import record_mixed, record_right
+from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
+from benchmarks.papers.reward_quality.embedding import EmbeddedFiles
+from benchmarks.papers.reward_quality.judging import Judge, fit_judge
+from benchmarks.papers.reward_quality.recording import Recorded, Sizes, plan, record
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.episodes.recording import EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet

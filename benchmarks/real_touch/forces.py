@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.benchmarks.real_touch.embedders import Embedder, find_embedder
+from benchmarks.options import BenchmarkOptions
+from benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.force import calibrate_force, change_statistics, resized

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.benchmarks.options import BenchmarkOptions
+from benchmarks.options import BenchmarkOptions
 from touchgoal.control.tactile.markers.tracker import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, MarkerGrid
 from touchgoal.episodes.importers.marker_pictures import (

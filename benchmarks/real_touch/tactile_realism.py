@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.benchmarks.real_touch.taxim_peer import (
+from benchmarks.options import BenchmarkOptions
+from benchmarks.real_touch.taxim_peer import (
     PIXEL_PITCH,
     TaximRenderer,
     has_jax,

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.benchmarks.real_touch.embedders import Embedder, find_embedder
+from benchmarks.options import BenchmarkOptions
+from benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.control.tactile.contact import contact_strength, threshold_for
 from touchgoal.encoders.probes import property_probe as probe
 from touchgoal.encoders.towers.towers import load_towers

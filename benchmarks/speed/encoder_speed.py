@@ -16,10 +16,10 @@ import torch
 from pydantic import Field
 from torch import nn
 
-from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.benchmarks.real_touch.embedders import vit_of
-from touchgoal.benchmarks.speed.rates import in_turn, one_core
-from touchgoal.benchmarks.speed.reward_parts import parts_table, time_parts
+from benchmarks.options import BenchmarkOptions
+from benchmarks.real_touch.embedders import vit_of
+from benchmarks.speed.rates import in_turn, one_core
+from benchmarks.speed.reward_parts import parts_table, time_parts
 from touchgoal.encoders.backbones.frame_history import RecentFrames
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.backbones.sparsh import sparsh_vit

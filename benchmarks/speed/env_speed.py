@@ -7,8 +7,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.benchmarks.speed.rates import Row, measure, one_core, table
+from benchmarks.options import BenchmarkOptions
+from benchmarks.speed.rates import Row, measure, one_core, table
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig

@@ -1,6 +1,6 @@
 """Processor time of a growing set of episodes: the first thousand against the last.
 
-    python -m touchgoal.benchmarks.speed.large_sets --episodes 20000 --root /dev/shm/large_set
+    python -m benchmarks.speed.large_sets --episodes 20000 --root /dev/shm/large_set
 
 Episodes have two frames and no pictures. Times are the process's own, s; opening and checking are divided
 by the thousands in the set.

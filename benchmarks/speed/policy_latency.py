@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.benchmarks.speed.rates import one_core
+from benchmarks.options import BenchmarkOptions
+from benchmarks.speed.rates import one_core
 from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from touchgoal.benchmarks.speed.rates import in_turn
+from benchmarks.speed.rates import in_turn
 from touchgoal.control.features import (
     CAMERA_SHAPE,
     CAMERAS,

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.benchmarks.options import BenchmarkOptions
+from benchmarks.options import BenchmarkOptions
 from touchgoal.control.features import TACTILE
 from touchgoal.episodes.recording import episode_specs, expert_alone, record_encoded
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter

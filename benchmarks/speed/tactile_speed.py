@@ -10,9 +10,9 @@ from typing import Any, no_type_check
 import numpy as np
 from numba import njit
 
-from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.benchmarks.real_touch.taxim_peer import has_jax, has_taxim
-from touchgoal.benchmarks.speed.rates import Row, measure, one_core, table
+from benchmarks.options import BenchmarkOptions
+from benchmarks.real_touch.taxim_peer import has_jax, has_taxim
+from benchmarks.speed.rates import Row, measure, one_core, table
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, SensorModel
 from touchgoal.runtime.errors import install_extra
 from touchgoal.runtime.option_types import Count, checked_dataclass

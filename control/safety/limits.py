@@ -76,7 +76,7 @@ class RobotLimits:
 # - indentation: twice the deepest press into a Mini in FEATS (0.86 mm). In simulation a golf ball at
 #   30 N, the least force of a Franka Hand (product manual), goes in by 1.2 mm, a pebble's edge by 2.
 # - reserve: the stream was at most 0.45 mm beside the commands' path in an hour
-#   (touchgoal benchmark sent-stream); a third more.
+#   (python -m benchmarks sent-stream); a third more.
 # - tip_speed: twice the reduced speed of ISO 10218-1, 0.25 m/s. Set that in the cell file on the first
 #   day, when a person may be near.
 # - tracking: our choice, without a source.
@@ -123,7 +123,7 @@ class TaskForces:
         return _CEILING_MARGIN * self.indentation
 
 
-# By `touchgoal benchmark task-ceilings`: 60 episodes of pick-place, and 60 with --feedback; 29 of the maze with
+# By `python -m benchmarks task-ceilings`: 60 episodes of pick-place, and 60 with --feedback; 29 of the maze with
 # a disturbance of 4 mm/s for the force, and six without for the indentation.
 TASK_FORCES: dict[str, TaskForces] = {
     "pick-place": TaskForces(force=16.5, indentation=2.1e-3, episodes=120),

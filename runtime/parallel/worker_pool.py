@@ -27,7 +27,9 @@ class WorkerPool(ProcessPoolExecutor):
         # OpenGL contexts do not survive a fork, so workers are forked from a server that never
         # renders; it imports once what this process has imported
         forkserver = multiprocessing.get_context("forkserver")
-        forkserver.set_forkserver_preload([m for m in sys.modules if m.startswith("touchgoal.")])
+        forkserver.set_forkserver_preload(
+            [m for m in sys.modules if m.startswith(("touchgoal.", "benchmarks."))]
+        )
         super().__init__(workers, mp_context=forkserver, initializer=_begin_work)
         self._ended = threading.Event()
         threading.Thread(target=self._notice_death, daemon=True).start()

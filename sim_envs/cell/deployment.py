@@ -53,7 +53,7 @@ IDEAL_DEPLOYMENT = DeploymentConfig(
     jitter=(0.0, 0.0),
     plan_ticks=(0,),
 )
-# Measured between `touchgoal deploy` and `touchgoal twin` (`touchgoal benchmark deploy`): states
+# Measured between `touchgoal deploy` and `touchgoal twin` (`python -m benchmarks deploy`): states
 # are 7 to 18 ms old; commands take 20 to 25 ms with the tracker's lag; plans come a tick late.
 # Cameras and fingertips: 25 to 30 frames a second (GelSight Mini and DIGIT data sheets).
 AS_DEPLOYED = DeploymentConfig(

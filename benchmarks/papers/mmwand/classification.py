@@ -14,17 +14,17 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
-from touchgoal.benchmarks.papers.mmwand.fine_tuned import (
+from benchmarks.options import BenchmarkOptions
+from benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
+from benchmarks.papers.mmwand.fine_tuned import (
     Modality,
     Network,
     fine_tune,
     read_pictures,
 )
-from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
-from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_classification
-from touchgoal.benchmarks.papers.mmwand.trained import (
+from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
+from benchmarks.papers.mmwand.real.dome_tables import run_classification
+from benchmarks.papers.mmwand.trained import (
     Trainable,
     embed_touches,
     read_touch_data,

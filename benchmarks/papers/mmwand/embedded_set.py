@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from touchgoal.benchmarks.real_touch.embedders import Embedder, find_embedder
+from benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.control.arrays import Picture
 from touchgoal.encoders.alignment.config import Split
 from touchgoal.encoders.alignment.splits import Fold, split_touches

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 
-from touchgoal.benchmarks.papers.mmwand.intervals import cell, mean_over_objects
+from benchmarks.papers.mmwand.intervals import cell, mean_over_objects
 from touchgoal.encoders.alignment.described_touches import embed_grasps
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers

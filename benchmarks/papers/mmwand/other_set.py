@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 
-from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
-from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
+from benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
+from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.heads import Heads, PairedEmbeddings, fit_heads
 from touchgoal.rewards.report.text_table import aligned

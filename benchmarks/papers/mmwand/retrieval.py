@@ -18,12 +18,12 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 
-from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
-from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
-from touchgoal.benchmarks.papers.mmwand.real.captioned_set import embed_captioned
-from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_retrieval
-from touchgoal.benchmarks.papers.mmwand.trained import (
+from benchmarks.options import BenchmarkOptions
+from benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
+from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
+from benchmarks.papers.mmwand.real.captioned_set import embed_captioned
+from benchmarks.papers.mmwand.real.dome_tables import run_retrieval
+from benchmarks.papers.mmwand.trained import (
     Trainable,
     embed_fold,
     read_touch_data,

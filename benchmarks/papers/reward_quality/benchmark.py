@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.benchmarks.options import CORES, BenchmarkOptions
-from touchgoal.benchmarks.papers.reward_quality import tables
-from touchgoal.benchmarks.papers.reward_quality.claims import judge_claims
-from touchgoal.benchmarks.papers.reward_quality.early_stopping import (
+from benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.papers.reward_quality import tables
+from benchmarks.papers.reward_quality.claims import judge_claims
+from benchmarks.papers.reward_quality.early_stopping import (
     judge_stopping,
     stopping_text,
 )
-from touchgoal.benchmarks.papers.reward_quality.embedding import EmbeddedFiles
-from touchgoal.benchmarks.papers.reward_quality.judging import Judge, fit_judge
-from touchgoal.benchmarks.papers.reward_quality.measures import (
+from benchmarks.papers.reward_quality.embedding import EmbeddedFiles
+from benchmarks.papers.reward_quality.judging import Judge, fit_judge
+from benchmarks.papers.reward_quality.measures import (
     Judged,
     auc,
     diagonal,
@@ -29,7 +29,7 @@ from touchgoal.benchmarks.papers.reward_quality.measures import (
     order,
     rank_with_time,
 )
-from touchgoal.benchmarks.papers.reward_quality.recording import (
+from benchmarks.papers.reward_quality.recording import (
     KINDS,
     SCENES,
     SUBOPTIMAL,

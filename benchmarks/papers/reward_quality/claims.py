@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from touchgoal.benchmarks.papers.reward_quality.measures import Judged
+from benchmarks.papers.reward_quality.measures import Judged
 from touchgoal.encoders.probes.bootstrap import mean_interval
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.rewards.curves import Curves

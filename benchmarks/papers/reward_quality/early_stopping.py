@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.benchmarks.papers.reward_quality.measures import Judged
+from benchmarks.papers.reward_quality.measures import Judged
 from touchgoal.rewards.distance.parts import FUSED
 from touchgoal.rewards.online.failure_watch import FailureWatch
 

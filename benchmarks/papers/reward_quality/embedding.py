@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from touchgoal.benchmarks.papers.reward_quality.recording import Recorded
+from benchmarks.papers.reward_quality.recording import Recorded
 from touchgoal.control.features import CAMERAS, TACTILE, TRUTH_CONTACT, WRENCH
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.benchmarks.papers.reward_quality.embedding import EmbeddedFiles, load_embedder
-from touchgoal.benchmarks.papers.reward_quality.measures import Judged
-from touchgoal.benchmarks.papers.reward_quality.recording import Recorded
-from touchgoal.benchmarks.papers.reward_quality.sentences import SENTENCES
+from benchmarks.papers.reward_quality.embedding import EmbeddedFiles, load_embedder
+from benchmarks.papers.reward_quality.measures import Judged
+from benchmarks.papers.reward_quality.recording import Recorded
+from benchmarks.papers.reward_quality.sentences import SENTENCES
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.embedding_distance import compute_curves
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer

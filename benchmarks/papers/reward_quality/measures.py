@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.benchmarks.papers.reward_objects import HELD_OUT_OBJECTS as OBJECTS
+from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS as OBJECTS
 from touchgoal.rewards.metrics import spearman
 
 SECOND_COSTS = 0.01

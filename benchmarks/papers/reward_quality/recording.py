@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from touchgoal.benchmarks.papers.reward_objects import HELD_OUT_OBJECTS, TRAINING_OBJECTS
+from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS, TRAINING_OBJECTS
 from touchgoal.episodes.format.set_files import INFO
 from touchgoal.episodes.recording import EpisodeSpec, collect, episode_spec
 from touchgoal.episodes.store import EpisodeSet

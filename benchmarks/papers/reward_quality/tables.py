@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from touchgoal.benchmarks.papers.reward_quality.measures import Estimate, Judged
+from benchmarks.papers.reward_quality.measures import Estimate, Judged
 from touchgoal.rewards.report.text_table import aligned
 from touchgoal.rewards.success import SuccessThreshold
 

@@ -14,13 +14,13 @@ from typing import Any
 
 import torch
 
-from touchgoal.benchmarks.papers.tacbench import data, probes
-from touchgoal.benchmarks.papers.tacbench.config import RECORDED_AS, Config, Recording
-from touchgoal.benchmarks.papers.tacbench.published_recordings import check_tasks, find_published
-from touchgoal.benchmarks.papers.tacbench.task import Task
-from touchgoal.benchmarks.papers.tacbench.trainings import TASKS, Job, Subject, work
-from touchgoal.benchmarks.papers.tacbench_report.figures import draw_by_labels
-from touchgoal.benchmarks.papers.tacbench_report.tables import table
+from benchmarks.papers.tacbench import data, probes
+from benchmarks.papers.tacbench.config import RECORDED_AS, Config, Recording
+from benchmarks.papers.tacbench.published_recordings import check_tasks, find_published
+from benchmarks.papers.tacbench.task import Task
+from benchmarks.papers.tacbench.trainings import TASKS, Job, Subject, work
+from benchmarks.papers.tacbench_report.figures import draw_by_labels
+from benchmarks.papers.tacbench_report.tables import table
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.preprocess import Preprocessor

@@ -1,11 +1,11 @@
-"""Options of `touchgoal benchmark tacbench`."""
+"""Options of `python -m benchmarks tacbench`."""
 
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
-from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.runtime.option_types import RARE, Count, Positive, Seed, checked_dataclass
 from touchgoal.sim_envs.config import RigConfig
 

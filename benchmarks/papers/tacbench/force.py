@@ -6,8 +6,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
-from touchgoal.benchmarks.papers.tacbench.task import Metrics, Outputs, Targets, split_force
+from benchmarks.papers.tacbench.data import RigFrames, Rows
+from benchmarks.papers.tacbench.task import Metrics, Outputs, Targets, split_force
 from touchgoal.encoders.probes.attentive import AttentiveProbe
 from touchgoal.encoders.probes.dense import DenseProbe
 from touchgoal.encoders.probes.property_probe import interval

@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
-from touchgoal.benchmarks.papers.tacbench.task import (
+from benchmarks.papers.tacbench.data import RigFrames, Rows
+from benchmarks.papers.tacbench.task import (
     Metrics,
     Outputs,
     Split,

@@ -6,8 +6,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
-from touchgoal.benchmarks.papers.tacbench.task import Metrics, Outputs, Targets, split_pose
+from benchmarks.papers.tacbench.data import RigFrames, Rows
+from benchmarks.papers.tacbench.task import Metrics, Outputs, Targets, split_pose
 from touchgoal.encoders.probes.attentive import AttentiveProbe
 from touchgoal.encoders.probes.property_probe import interval
 

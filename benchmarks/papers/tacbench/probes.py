@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float, Float16
 from torch import Tensor, nn
 
-from touchgoal.benchmarks.papers.tacbench.config import Config
-from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, Rows
-from touchgoal.benchmarks.papers.tacbench.task import Outputs, Task
-from touchgoal.benchmarks.real_touch.embedders import untrained, vit_of
+from benchmarks.papers.tacbench.config import Config
+from benchmarks.papers.tacbench.data import STRIDE, RigFrames, Rows
+from benchmarks.papers.tacbench.task import Outputs, Task
+from benchmarks.real_touch.embedders import untrained, vit_of
 from touchgoal.encoders.backbones.touch_backbone import (
     BATCH,
     BaseTouchEncoder,

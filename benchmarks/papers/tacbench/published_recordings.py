@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
-from touchgoal.benchmarks.papers.tacbench.config import RECORDED_AS, Recording
-from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, assemble, preprocessed
-from touchgoal.benchmarks.papers.tacbench.task import TEST, VALIDATION
+from benchmarks.papers.tacbench.config import RECORDED_AS, Recording
+from benchmarks.papers.tacbench.data import STRIDE, RigFrames, assemble, preprocessed
+from benchmarks.papers.tacbench.task import TEST, VALIDATION
 from touchgoal.encoders.preprocess import Preprocessor
 from touchgoal.episodes.importers.feeling_of_success import MOMENTS, is_grasp_set, read_grasps
 from touchgoal.episodes.importers.tacbench_forces import is_force_set, read_strokes

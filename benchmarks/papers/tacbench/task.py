@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
+from benchmarks.papers.tacbench.data import RigFrames, Rows
 
 VALIDATION, TEST = 3, 4
 """Use of the last two of every five recordings of an object; the first three are trained on."""

@@ -9,14 +9,14 @@ from typing import Any
 
 import torch
 
-from touchgoal.benchmarks.papers.tacbench import probes
-from touchgoal.benchmarks.papers.tacbench.config import Config
-from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
-from touchgoal.benchmarks.papers.tacbench.force import FieldTask, ForceTask
-from touchgoal.benchmarks.papers.tacbench.labels import grasp_task, textile_task
-from touchgoal.benchmarks.papers.tacbench.pose import PoseTask
-from touchgoal.benchmarks.papers.tacbench.slip import SlipTask
-from touchgoal.benchmarks.papers.tacbench.task import Task, thinned
+from benchmarks.papers.tacbench import probes
+from benchmarks.papers.tacbench.config import Config
+from benchmarks.papers.tacbench.data import RigFrames, Rows
+from benchmarks.papers.tacbench.force import FieldTask, ForceTask
+from benchmarks.papers.tacbench.labels import grasp_task, textile_task
+from benchmarks.papers.tacbench.pose import PoseTask
+from benchmarks.papers.tacbench.slip import SlipTask
+from benchmarks.papers.tacbench.task import Task, thinned
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 
 TASKS: dict[str, Callable[[RigFrames], Task]] = {

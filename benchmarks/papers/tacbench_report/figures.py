@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from touchgoal.benchmarks.papers.tacbench.probes import END_TO_END, RANDOM
-from touchgoal.benchmarks.papers.tacbench_report.published import SHARES, published
-from touchgoal.benchmarks.papers.tacbench_report.tables import LAYOUTS
+from benchmarks.papers.tacbench.probes import END_TO_END, RANDOM
+from benchmarks.papers.tacbench_report.published import SHARES, published
+from benchmarks.papers.tacbench_report.tables import LAYOUTS
 
 _TITLES = {
     "force": "T1: mean absolute error of the force (mN)",

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from touchgoal.benchmarks.papers.tacbench.config import Config
-from touchgoal.benchmarks.papers.tacbench.probes import END_TO_END, RANDOM
-from touchgoal.benchmarks.papers.tacbench_report.published import (
+from benchmarks.papers.tacbench.config import Config
+from benchmarks.papers.tacbench.probes import END_TO_END, RANDOM
+from benchmarks.papers.tacbench_report.published import (
     BEST_AGAINST_END_TO_END,
     SHARES,
     published,

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from touchgoal.benchmarks.papers.mmwand.embedded_set import (
+from benchmarks.papers.mmwand.embedded_set import (
     EmbeddedSet,
     cached,
     small_change,
     touch_key,
 )
-from touchgoal.benchmarks.real_touch.embedders import Embedder, find_embedder
+from benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.control.arrays import Picture
 from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.episodes.importers.touch_clip import decode

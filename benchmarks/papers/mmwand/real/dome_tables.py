@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
-from touchgoal.benchmarks.papers.mmwand.real.dome_set import (
+from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
+from benchmarks.papers.mmwand.real.dome_set import (
     INPUTS,
     PIXELS,
     DomeFold,

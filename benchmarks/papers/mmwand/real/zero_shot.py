@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.benchmarks.options import BenchmarkOptions
-from touchgoal.benchmarks.papers.mmwand.grasped_objects import run_grasped_objects
-from touchgoal.benchmarks.papers.mmwand.other_set import run_other_set
+from benchmarks.options import BenchmarkOptions
+from benchmarks.papers.mmwand.grasped_objects import run_grasped_objects
+from benchmarks.papers.mmwand.other_set import run_other_set
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes.bootstrap import mean_interval

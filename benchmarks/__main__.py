@@ -1,17 +1,19 @@
-"""Print one table of measured figures and keep its numbers."""
+"""Print one table of measured figures and keep its numbers: `python -m benchmarks NAME [options]`."""
 
 import sys
 from importlib import import_module
-from types import ModuleType
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import tyro
-
+from benchmarks.records import describe, records_of
+from touchgoal.launch.support.command_line import parse
+from touchgoal.launch.support.process import run_command, standard_streams
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.json_file import write_json
-from touchgoal.runtime.option_types import checked_dataclass
+from touchgoal.runtime.picture_file import write_picture
 from touchgoal.runtime.provenance import hardware, provenance
-from touchgoal.runtime.run_folder import open_run
+from touchgoal.runtime.run_folder import check_writable, open_run
+
+PROGRAM = "python -m benchmarks"
 
 BENCHMARKS = {
     "bead-maze": ("papers.bead_maze", "bead maze: success on unseen wires (TacBench T5)"),
@@ -60,46 +62,24 @@ BENCHMARKS = {
     "scaling": ("speed.scaling", "collection and embedding on more cores, and on Ray"),
     "tactile-speed": ("speed.tactile_speed", "simulated tactile images a second"),
 }
-"""Module in `touchgoal.benchmarks` and meaning of each benchmark."""
+"""Module in `benchmarks` and meaning of each benchmark."""
 
 
-@checked_dataclass
-class Config:
-    """Options of benchmark, before those of the chosen one."""
+def main(argv: list[str] | None = None) -> None:
+    """Run one benchmark, or print what is on record of it with `--recorded`."""
+    arguments = sys.argv[1:] if argv is None else argv
+    with standard_streams():
+        if not arguments or arguments[0] in ("-h", "--help"):
+            print(_usage())
+        else:
+            run_command(PROGRAM, arguments, _run)
 
-    name: Annotated[Literal[tuple(BENCHMARKS)], tyro.conf.Positional]  # pyright: ignore[reportInvalidTypeForm]
-    """Benchmark to run."""
-    recorded: bool = False
-    """Print the table on record instead."""
 
-
-def choose(arguments: list[str]) -> tuple[ModuleType, list[str]]:
-    """Return the module of the named benchmark and the options that follow the name.
-
-    `--recorded` prints the records instead and exits. UserError if there is no such benchmark.
-    """
-    name, *options = arguments or ["--help"]
-    if name in ("-h", "--help"):
-        print(_usage())
-        sys.exit(0)
+def _run(name: str, *options: str) -> None:
     if "--recorded" in options:
-        from touchgoal.benchmarks.records import describe, records_of
-
         print("\n\n".join(describe(record) for record in records_of(name)))
-        sys.exit(0)
-    if name not in BENCHMARKS:
-        raise UserError(f"there is no benchmark {name!r}; choose from: {', '.join(BENCHMARKS)}")
-    return import_module(f"touchgoal.benchmarks.{BENCHMARKS[name][0]}"), options
-
-
-def main(config: Any) -> None:
-    """Run the benchmark whose `Config` this is."""
-    from touchgoal.runtime.picture_file import write_picture
-
-    module = sys.modules[type(config).__module__]
-    path = module.__name__.removeprefix("touchgoal.benchmarks.").removesuffix(".config")
-    name = next(n for n, (p, _) in BENCHMARKS.items() if p.startswith(path))
-    benchmark = import_module(f"touchgoal.benchmarks.{BENCHMARKS[name][0]}")
+        return
+    benchmark, config = read_options(name, list(options))
     out = open_run(config.out, f"benchmark-{name}", config)
     result = benchmark.run(config)
     print(result.pop("table"))
@@ -108,13 +88,27 @@ def main(config: Any) -> None:
         print(f"picture: {out / title}.png")
     print(f"hardware: {hardware()}")
     write_json(out / "metrics.json", {**provenance(), "hardware": hardware(), **result})
-    print(f"numbers: {out / 'metrics.json'}; the record: touchgoal benchmark {name} --recorded")
+    print(f"numbers: {out / 'metrics.json'}; the record: {PROGRAM} {name} --recorded")
+
+
+def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
+    """Return a benchmark's module and its checked Config; UserError if there is no such benchmark."""
+    if name not in BENCHMARKS:
+        raise UserError(f"there is no benchmark {name!r}; choose from: {', '.join(BENCHMARKS)}")
+    module: Any = import_module(f"benchmarks.{BENCHMARKS[name][0]}")
+    envs = getattr(module, "ENVS", None)
+    config = parse(module.Config, options, f"{PROGRAM} {name}", module.__doc__ or "", envs)
+    check_writable(config.out)
+    return module, config
 
 
 def _usage() -> str:
     lines = [f"  {name:<17}{meaning}" for name, (_, meaning) in BENCHMARKS.items()]
     return (
-        "usage: touchgoal benchmark NAME [options]\n       touchgoal benchmark NAME --help\n"
-        "       touchgoal benchmark NAME --recorded   (print the table on record)\n\n"
-        + "\n".join(lines)
+        f"usage: {PROGRAM} NAME [options]\n       {PROGRAM} NAME --help\n"
+        f"       {PROGRAM} NAME --recorded   (print the table on record)\n\n" + "\n".join(lines)
     )
+
+
+if __name__ == "__main__":
+    main()
