@@ -6,9 +6,9 @@ import sys
 from difflib import get_close_matches
 from typing import Any
 
-from touchgoal import __version__
 from touchgoal.launch.support.process import run_command, standard_streams
 from touchgoal.runtime.run_folder import check_writable
+from touchgoal.runtime.version import __version__
 
 COMMANDS = {
     "demo": "pick an object up and place it in simulation, and draw its distance to the goal",

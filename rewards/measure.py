@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from touchgoal import __version__
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.rewards.embed_trajectories import Count, Embedded
 from touchgoal.rewards.goals import GoalSpec, content_checksum
@@ -20,6 +19,7 @@ from touchgoal.rewards.sources.trajectory import Skipped, Trajectory
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import progress_bar
+from touchgoal.runtime.version import __version__
 
 SKIPPED = "skipped.csv"
 _RECORDS = "measured"

@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from touchgoal import __version__
+from touchgoal.runtime.version import __version__
 
 _PROGRAMS = ("touchgoal ", "python -m benchmarks ")
 _PACKAGES = ("numpy", "torch", "mujoco", "opencv-contrib-python-headless")

@@ -63,13 +63,6 @@ def test_fast_math_calls_inlined_functions_alone(path: Path) -> None:
     assert apart and not called & apart
 
 
-def test_version_is_said_once() -> None:
-    from touchgoal import __version__
-
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["version"] == __version__
-
-
 def test_every_data_file_is_packaged() -> None:
     """Weights, sensor files and cell files are in the wheel."""
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())

@@ -6,7 +6,8 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
+from touchgoal.runtime.version import __version__ as __version__
+from touchgoal.sim_envs.registration import register_environments
 
 if TYPE_CHECKING:
     from touchgoal.encoders.pretrained import load_encoder as load_encoder
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
     from touchgoal.rewards.api import reward_curve as reward_curve
     from touchgoal.rewards.environments import make as make
     from touchgoal.rewards.environments import make_vec as make_vec
-
-__version__ = "0.1.0"
 
 
 def _headless_opengl() -> str:
@@ -34,20 +33,7 @@ def _headless_opengl() -> str:
 if sys.platform == "linux" and "DISPLAY" not in os.environ and "MUJOCO_GL" not in os.environ:
     os.environ["MUJOCO_GL"] = _headless_opengl()
 
-gymnasium.register(
-    "touchgoal/PickPlace-v0", "touchgoal.sim_envs.pick_place:PickPlace", max_episode_steps=160
-)
-gymnasium.register(
-    "touchgoal/BeadMaze-v0", "touchgoal.sim_envs.bead_maze:BeadMaze", max_episode_steps=800
-)
-gymnasium.register(
-    "touchgoal/FragileCarry-v0",
-    "touchgoal.sim_envs.fragile_carry:FragileCarry",
-    max_episode_steps=160,
-)
-gymnasium.register(
-    "touchgoal/TouchWand-v0", "touchgoal.sim_envs.touch_wand:TouchWand", max_episode_steps=50
-)
+register_environments()
 
 _INTERFACE = {  # one call a job, imported at its first use: `import touchgoal` stays light
     "evaluate": "touchgoal.policies.evaluation.evaluate",
