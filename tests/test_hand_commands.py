@@ -16,9 +16,7 @@ OPEN = 0.08  # m
 
 
 class Fingers:
-    """Fingers with something between them, in steps of 1 ms; also all that an environment is asked for."""
-
-    robot = SimpleNamespace(tool=FR3.tool)
+    """Fingers with something between them, in steps of 1 ms."""
 
     def __init__(self, between: float) -> None:
         self.between, self.at = between, OPEN
@@ -100,7 +98,7 @@ def driven(monkeypatch: pytest.MonkeyPatch, wanted: list[float], between: float)
 def simulated(wanted: list[float], between: float) -> np.ndarray:
     """Return the widths that the environment's hand makes of the same targets."""
     fingers, widths = Fingers(between), []
-    hand = DeployedHand(fingers, np.random.default_rng(0))
+    hand = DeployedHand(fingers.width, FR3.tool.stroke[1], np.random.default_rng(0))
     phase = int(np.random.default_rng(0).integers(LOOK))  # of its looks
     for ms in range(LOOK * len(wanted)):
         fingers.go(hand.step(ms + phase, wanted[ms // LOOK]))

@@ -4,7 +4,8 @@ Joint changes pass its lag, safety layer and 1 kHz tracker; observations are as 
 """
 
 from collections import deque
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,6 +16,7 @@ from touchgoal.control.motion.tracker import SERVO_DAMPING, ServoLag, Tracker
 from touchgoal.control.safety.action_filter import ActionFilter, Measurements
 from touchgoal.sim_envs.cell.deployment import DeploymentConfig
 from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench
+from touchgoal.sim_envs.cell.hardware import SimulatedHardware
 
 _DT = 1e-3  # s
 _WRENCH_PERIOD = 10  # ms between estimates of the force on the hand
@@ -86,10 +88,13 @@ class _TrackedDrive:
 class DeployedHand:
     """A Franka Hand behind its driver in one episode, open and at rest at first."""
 
-    def __init__(self, env: Any, rng: np.random.Generator) -> None:
-        self._env = env
+    def __init__(
+        self, read_width: Callable[[], float], max_width: float, rng: np.random.Generator
+    ) -> None:
+        """Take what reads the fingers' width (m), and their largest width (m)."""
+        self._read_width, self._max_width = read_width, max_width
         self._phase = int(rng.integers(_HAND_PERIOD))
-        self._goal = self.width = env.width()  # width: last reading, m
+        self._goal = self.width = read_width()  # width: last reading, m
         self._commands = HandCommands(self.width)
         self._last: LastCommand = "arrived"
         self._grasps, self._age = False, 0
@@ -101,7 +106,7 @@ class DeployedHand:
         return self._goal
 
     def _look(self, target_width: float) -> None:
-        before, self.width = self.width, self._env.width()
+        before, self.width = self.width, self._read_width()
         self._age += 1
         if self._last == "runs" and self._age > _LEAST:
             if abs(self.width - self._goal) < _ARRIVED:
@@ -109,7 +114,7 @@ class DeployedHand:
             elif abs(self.width - before) < _STILL:
                 self._last = "stopped short"
         grasped = self._grasps and self._last != "runs" and self.width > CLOSED_WIDTH
-        target = min(max(target_width, 0.0), self._env.robot.tool.stroke[1])
+        target = min(max(target_width, 0.0), self._max_width)
         command = self._commands.next(target, self.width, grasped, self._last)
         if command is not None:
             self._grasps = command.grasp
@@ -120,27 +125,42 @@ class DeployedHand:
 class DeployedArm:
     """The environment's arm as deployed, for one episode that begins at rest."""
 
-    def __init__(self, env: Any, deployment: DeploymentConfig, rng: np.random.Generator) -> None:
-        """Draw delays of an environment's episode from a resolved config."""
+    def __init__(
+        self,
+        hardware: SimulatedHardware,
+        start: Joints,
+        deployment: DeploymentConfig,
+        monitor_force: Callable[[float], bool],
+        rng: np.random.Generator,
+    ) -> None:
+        """Draw the delays of an episode.
+
+        Args:
+            hardware: arm, hand and sensors.
+            start: commanded joints at first, rad.
+            deployment: a resolved config.
+            monitor_force: takes the seconds since its last call, and tells whether the force on the
+                hand is too high.
+            rng: draws delays and errors.
+        """
         assert deployment.plan_ticks is not None
-        self._env = env
-        hz = env.config.control_hz
+        self._hardware, self._monitor_force = hardware, monitor_force
+        hz = hardware.config.control_hz
         self._tick_ms = round(1000 / hz)
-        start = env.command.copy()
-        n = env.n_joints
         if deployment.tracker:
-            # Set-points with feed-forward reach beyond the joints' range; the tracker keeps to it.
-            env.model.actuator_ctrllimited[:n] = 0
+            hardware.release_setpoints()
             self._drive: _TrackedDrive | _DirectDrive = _TrackedDrive(
-                start, ActionFilter(env.robot, hz)
+                start, ActionFilter(hardware.robot, hz)
             )
         else:
-            limits = env.model.actuator_ctrlrange[:n]
-            self._drive = _DirectDrive(start, limits, self._tick_ms)
-        self._hand = DeployedHand(env, rng) if deployment.franka_hand else None
+            self._drive = _DirectDrive(start, hardware.setpoint_range, self._tick_ms)
+        stroke = hardware.robot.tool.stroke
+        self._hand = (
+            DeployedHand(hardware.width, stroke[1], rng) if deployment.franka_hand else None
+        )
         self._wrench = EstimatedWrench(rng) if deployment.estimated_wrench else None
         self.plan_ticks = int(rng.choice(deployment.plan_ticks))  # by which learned plans are late
-        ticks = round(env.config.max_seconds * hz) + _AHEAD
+        ticks = round(hardware.config.max_seconds * hz) + _AHEAD
         jitter = rng.uniform(*_range(deployment.jitter))
         self._state_at = _read_times(rng, deployment.state_delay, jitter, ticks, self._tick_ms)
         period = 1000 / (deployment.picture_rate or 1000.0)
@@ -150,36 +170,39 @@ class DeployedArm:
         delays = _delays(rng, deployment.command_delay, jitter, ticks)
         # A command never overtakes the one before it.
         self._arrives = np.maximum.accumulate(np.arange(ticks) * self._tick_ms + delays)
-        self._steps = round(_DT / env.model.opt.timestep)
+        self._steps = round(_DT / hardware.model.opt.timestep)
         self._ms, self._tick = 0, 0
         self._commands: deque[tuple[int, Joints, float]] = deque()
-        self._width = env.width_target()
+        self._width = hardware.width_target()
         self._states = {0: self._read_state()}
-        self._pictures = {0: (env.take_pictures(), env.pad_contacts())}
-        self.contacts = env.pad_contacts()  # at the time of the last observation's images
+        self._pictures = {0: (hardware.take_pictures(), hardware.pad_contacts())}
+        self.contacts = hardware.pad_contacts()  # at the time of the last observation's images
 
-    def run_tick(self, delta: Joints, width: float) -> None:
-        """Run a control tick with the policy's action; end it where the force is too high."""
-        env = self._env
+    def run_tick(self, delta: Joints, width: float) -> Joints:
+        """Run a control tick with the policy's action; end it where the force is too high.
+
+        Return the commanded joints, rad.
+        """
+        hardware = self._hardware
         target = self._drive.accept(np.asarray(delta, np.float64))
-        env.command = self._drive.command
         self._commands.append((int(self._arrives[self._tick]), target, float(width)))
         self._tick += 1
         end = self._ms + self._tick_ms
         reads = self._moments(self._state_at, end)
         shots = self._moments(self._picture_at, end)
-        too_high = False
+        too_high, speed = False, hardware.robot.tool.speed
         while self._ms < end and not too_high:
             while self._commands and self._commands[0][0] <= self._ms:
                 _, target, self._width = self._commands.popleft()
                 self._drive.set_target(target)
             width = self._hand.step(self._ms, self._width) if self._hand else self._width
-            env.step_physics(self._drive.step(), width, env.robot.tool.speed, self._steps)
+            hardware.step_physics(self._drive.step(), width, speed, self._steps)
             self._ms += 1
             self._measure(self._ms in reads, self._ms in shots)
             if self._ms % _FORCE_PERIOD == 0:
-                too_high = env.monitor_force(_FORCE_PERIOD * _DT)
-        env.update_contacts()
+                too_high = self._monitor_force(_FORCE_PERIOD * _DT)
+        hardware.update_contacts()
+        return self._drive.command
 
     def observation(self) -> dict[str, np.ndarray]:
         """Return the policy's observation after the last tick."""
@@ -190,20 +213,20 @@ class DeployedArm:
         return {**state, **pictures, ft.AGE: np.array([age], np.float32)}
 
     def _measure(self, read: bool, shoot: bool) -> None:
-        env = self._env
+        hardware = self._hardware
         wrench = self._wrench if self._ms % _WRENCH_PERIOD == 0 else None
         if not (read or shoot or wrench):
             return
-        env.update_contacts()
+        hardware.update_contacts()
         if wrench:
-            wrench.update(env.external_wrench(), _WRENCH_PERIOD * _DT)
+            wrench.update(hardware.external_wrench(), _WRENCH_PERIOD * _DT)
         if read:
             self._states[self._ms] = self._read_state()
         if shoot:
-            self._pictures[self._ms] = env.take_pictures(), env.pad_contacts()
+            self._pictures[self._ms] = hardware.take_pictures(), hardware.pad_contacts()
 
     def _read_state(self) -> dict[str, np.ndarray]:
-        state = self._env.read_proprioception()
+        state = self._hardware.read_proprioception()
         if self._wrench:
             state[ft.WRENCH] = self._wrench.read().astype(np.float32)
         if self._hand:

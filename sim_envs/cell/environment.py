@@ -169,7 +169,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         self._command_before = self.command
         self.begin_tick()
         if self._deployed:
-            self._deployed.run_tick(action[:-1], action[-1])
+            self.command = self._deployed.run_tick(action[:-1], action[-1])
         else:
             self._run_tick(action[:-1], action[-1], seconds=1 / self.config.control_hz)
         progress, success = self.end_tick()
@@ -267,8 +267,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         setpoints = round(seconds / SETPOINT_PERIOD)
         steps = round(SETPOINT_PERIOD / self.model.opt.timestep)
         start = self.command
-        limits = self.model.actuator_ctrlrange[: self.n_joints]
-        self.command = np.clip(start + delta, limits[:, 0], limits[:, 1])
+        self.command = np.clip(start + delta, *self.setpoint_range.T)
         speed = self.robot.tool.speed
         for joints in np.linspace(start, self.command, setpoints + 1)[1:]:
             self.step_physics(joints, width, speed, steps)
@@ -288,7 +287,10 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         self._deployed: DeployedArm | None = None
         deployment = self.config.resolved_deployment()
         if deployment != IDEAL_DEPLOYMENT:
-            self._deployed = DeployedArm(self, deployment, self.np_random.spawn(1)[0])
+            rng = self.np_random.spawn(1)[0]
+            self._deployed = DeployedArm(
+                self, self.command.copy(), deployment, self.monitor_force, rng
+            )
 
     def _observe(self) -> Observation:
         command = {ft.COMMAND: self._read_command()}

@@ -67,11 +67,9 @@ class SimulatedCell:
         env.reset(seed=seed, options=options)
         n = env.n_joints
         model = env.model
-        model.actuator_ctrllimited[:n] = 0  # feed-forward reaches beyond the range; arms check it
+        env.release_setpoints()
         self._scratch = mujoco.MjData(model)
         self._hand, self._tcp = model.body("hand").id, model.site("tcp").id
-        self._servo = model.actuator_gainprm[:n].copy(), model.actuator_biasprm[:n].copy()
-        self._friction = model.dof_frictionloss.copy()
         self._torque: Joints | None = None
         self._braking: Joints | None = None
         self._yielding = False
@@ -253,14 +251,8 @@ class SimulatedCell:
         self._braking, self._yielding = None, False
         if torque == (self._torque is not None):
             return
-        env, n = self.env, self.env.n_joints
-        gain, bias = self._servo
-        env.model.actuator_gainprm[:n] = 0.0 if torque else gain
-        env.model.actuator_biasprm[:n] = 0.0 if torque else bias
-        env.model.dof_frictionloss[env.arm_dofs] = 0.0 if torque else self._friction[env.arm_dofs]
+        self.env.use_torque_control(torque)
         self._torque = None
-        if not torque:
-            env.data.qfrc_applied[env.arm_dofs] = 0.0
 
 
 @njit(cache=True)
