@@ -19,27 +19,20 @@ _SENSOR_NAMES = ("tactile", "gelsight", "digit", "touch")
 _SIDES = {"left": TACTILE_LEFT, "right": TACTILE_RIGHT}
 
 
-_of_command: dict[str, str] = {}
-
-
-def use_keys(pairs: Sequence[str]) -> None:
-    """Take a command's `--keys STORED=KEY ...` for every set that it opens, goals included.
+def parse_keys(pairs: Sequence[str]) -> dict[str, str]:
+    """Return the new keys by stored names of an option `--keys STORED=KEY ...`.
 
     UserError: a pair of another form.
     """
-    _of_command.clear()
+    keys = {}
     for pair in pairs:
         stored, equals, key = pair.partition("=")
         if not (stored and equals and key):
             raise UserError(
                 f"--keys {pair}: give STORED=KEY, such as observation.images.top={IMAGE_PREFIX}front"
             )
-        _of_command[stored] = key
-
-
-def keys_of_command(features: Features) -> dict[str, str]:
-    """Return the command's map for a set; a set that has the new key and not the old one is left."""
-    return {k: v for k, v in _of_command.items() if k in features or v not in features}
+        keys[stored] = key
+    return keys
 
 
 def readable_features(features: Features) -> Features:

@@ -32,7 +32,6 @@ from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.episodes.format.repair import unlisted_files
 from touchgoal.episodes.keys import (
     guess_keys,
-    keys_of_command,
     note_guess,
     readable_features,
     stored_names,
@@ -158,9 +157,10 @@ class EpisodeSet:
             root: Folder of the set, or of the run that recorded it into its `episodes/`; or its address,
                 such as s3://bucket/set (see `remote`). Attribute `root` is then the mirror.
             complete: Whether every file must be there; else `read` finds what is missing.
-            keys: New keys of features by their stored names; None for those of the command
-                (`--keys`). In a set that touchgoal did not write, tactile images under other names
-                are recognised without (noted on stderr).
+            keys: New keys of features by their stored names. A set that has the new key and not the
+                stored name is left as it is, so that one map serves sets of both kinds. In a set that
+                touchgoal did not write, tactile images under other names are recognised without
+                (noted on stderr).
 
         Raises:
             UserError: Not a set, or of an unknown version; a metadata file is corrupt; a file is
@@ -173,7 +173,9 @@ class EpisodeSet:
         self.foreign = foreign_file(self.root, info["features"], table) is not None
         """Whether lerobot wrote, edited or continued the set; touchgoal does not change such a one."""
         features = readable_features(info["features"])
-        given = keys_of_command(features) if keys is None else dict(keys)
+        self.keys = dict(keys or {})
+        """New keys of features by their stored names, as given."""
+        given = {k: v for k, v in self.keys.items() if k in features or v not in features}
         guessed = guess_keys(features) if self.foreign else {}
         if guessed := {k: v for k, v in guessed.items() if k not in given}:
             note_guess(self.root, tuple(guessed.items()))

@@ -57,7 +57,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, embed, fit, and write normalizer.json."""
-    from touchgoal.episodes.keys import use_keys
+    from touchgoal.episodes.keys import parse_keys
     from touchgoal.episodes.schema import Episode, joined
     from touchgoal.rewards.demonstration_costs import accepted_failures, last_costs
     from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
@@ -72,9 +72,9 @@ def main(config: Config) -> None:
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run
 
-    use_keys(config.keys)
+    keys = parse_keys(config.keys)
     with_touch = config.towers is None or config.encoder is not None
-    sources = open_successes(config.sources, config.camera, with_touch, config.assume_success)
+    sources = open_successes(config.sources, config.camera, with_touch, config.assume_success, keys)
     inputs = sources[0].inputs
     embedder, _ = load_embedder(inputs, config.encoder, config.towers, config.device)
     trajectories = [t for source in sources for t in source.trajectories]

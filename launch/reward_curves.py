@@ -73,7 +73,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, measure what is not measured yet, and write the reports."""
-    from touchgoal.episodes.keys import use_keys
+    from touchgoal.episodes.keys import parse_keys
     from touchgoal.rewards.audit import audit_trajectories
     from touchgoal.rewards.default_goal import goals_of
     from touchgoal.rewards.embed_trajectories import EncoderOptions, embed_here, embed_on_ray
@@ -95,12 +95,12 @@ def main(config: Config) -> None:
         load_rerun(config.rerun)
     if config.ray is not None and config.device != "cpu":
         raise UserError("--ray works on the cores of a cluster: leave out --device")
-    use_keys(config.keys)
+    keys = parse_keys(config.keys)
     with_touch = config.towers is None or config.encoder is not None
-    source = open_source(config.source, config.camera, config.index, with_touch, config.fps)
+    source = open_source(config.source, config.camera, config.index, with_touch, config.fps, keys)
     if source.summary:
         print(source.summary)
-    given = [parse_goal(text) for text in config.goal]
+    given = [parse_goal(text, keys) for text in config.goal]
     goals = {} if given else goals_of(source.trajectories)
     if any(isinstance(goal, Bank) for goal in goals.values()):
         print("failures are among the episodes: the goal is the nearest end of other successes")

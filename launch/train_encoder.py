@@ -193,10 +193,12 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
     from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
     from touchgoal.encoders.ssl.train import train_unlabelled
     from touchgoal.encoders.ssl.unlabelled_touch import open_touch
-    from touchgoal.encoders.training.run import check_training, open_training
+    from touchgoal.encoders.training.run import check_run, open_training
+    from touchgoal.episodes.keys import parse_keys
 
-    check_training(config, config.out)
-    touch = open_touch(config.data, config.validation, config.sensor)
+    check_run(config, config.out)
+    keys = parse_keys(config.keys)
+    touch = open_touch(config.data, config.validation, config.sensor, keys)
     out = open_training(config, "train-encoder")
     method = type(config).__name__.lower()
     single = isinstance(config, Mae) and not config.mae.stacked

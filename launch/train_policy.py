@@ -156,8 +156,9 @@ class Config(TrainingOptions):
 def main(config: Config) -> None:
     """Embed touch, train, choose a snapshot."""
     from touchgoal.encoders.pretrained import find_encoder
-    from touchgoal.encoders.training.run import check_training, open_sets, open_training, recipe
+    from touchgoal.encoders.training.run import check_run, open_sets, open_training, recipe
     from touchgoal.encoders.training.trainer import is_first_process
+    from touchgoal.episodes.keys import parse_keys
     from touchgoal.policies.checkpoint import ESTIMATOR, TOUCH
     from touchgoal.policies.perception.frozen_touch import load_touch
     from touchgoal.policies.perception.state_estimation import load_pose_estimator
@@ -168,7 +169,7 @@ def main(config: Config) -> None:
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.json_file import write_json
 
-    check_training(config, config.out)
+    check_run(config, config.out)
     if config.end_to_end and config.encoder:
         raise UserError("--end-to-end and --encoder exclude each other: leave out one")
     if config.cameras and config.estimator:
@@ -178,7 +179,7 @@ def main(config: Config) -> None:
     if config.estimator:
         load_pose_estimator(config.estimator)
         parts[ESTIMATOR] = config.estimator
-    sets = open_sets(config.data, config.validation)
+    sets = open_sets(config.data, config.validation, parse_keys(config.keys))
     unknown, failed = config.include_unknown, config.progress is not None
     found = [
         training_data.choose_episodes(sets[0], unknown, failed),

@@ -46,7 +46,7 @@ def _successful_ends(trajectory: EpisodeTrajectory, successes: Mapping[str, list
     root, what = trajectory.episodes.root, str(trajectory.meta.get("object", ""))
     same_object = successes.get(what, [])
     if set(same_object) - {trajectory.index}:
-        return Bank(root)
+        return Bank(root, trajectory.episodes.keys)
     if same_object:
         return OwnFrame()
     raise UserError(

@@ -8,7 +8,7 @@ Without touch, and with towers that were trained together (a CLIP), a sentence i
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -111,6 +111,7 @@ class EpisodeEnd:
 
     root: Path
     index: int
+    keys: Mapping[str, str] = field(default_factory=dict, hash=False)  # as for `EpisodeSet`
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
@@ -122,7 +123,7 @@ class EpisodeEnd:
         The simulator's contact and the wrench are added where they are recorded. UserError: no such set, episode or
         key.
         """
-        episodes = EpisodeSet(self.root)
+        episodes = EpisodeSet(self.root, keys=self.keys)
         if self.index >= len(episodes):
             raise UserError(
                 f"goal '{self}' does not exist: {self.root} has episodes 0 to {len(episodes) - 1}"
@@ -141,6 +142,7 @@ class Bank:
     """
 
     root: Path
+    keys: Mapping[str, str] = field(default_factory=dict, hash=False)  # as for `EpisodeSet`
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
@@ -148,11 +150,11 @@ class Bank:
 
     def ends(self) -> list[EpisodeEnd]:
         """Return the ends; UserError: no such set, or no episode marked as a success."""
-        episodes = EpisodeSet(self.root)
+        episodes = EpisodeSet(self.root, keys=self.keys)
         found = [i for i in range(len(episodes)) if episodes.meta(i).get("success") is True]
         if not found:
             raise UserError(f"goal '{self}': no episode of {self.root} is marked as a success")
-        return [EpisodeEnd(self.root, i) for i in found]
+        return [EpisodeEnd(self.root, i, self.keys) for i in found]
 
 
 @dataclass(frozen=True)
@@ -190,9 +192,9 @@ class Sentence:
 def content_checksum(spec: "GoalSpec") -> str:
     """Return a text that changes when what a goal refers to does: its picture, episodes or file."""
     if isinstance(spec, EpisodeEnd):
-        return EpisodeSet(spec.root).episode_checksum(spec.index)
+        return EpisodeSet(spec.root, keys=spec.keys).episode_checksum(spec.index)
     if isinstance(spec, Bank):
-        return EpisodeSet(spec.root).checksum
+        return EpisodeSet(spec.root, keys=spec.keys).checksum
     if isinstance(spec, GoalFile):
         return hashlib.sha256(spec.path.read_bytes()).hexdigest()
     if isinstance(spec, GoalPicture):
@@ -230,8 +232,11 @@ class Goal:
         return {name: str(spec) for name, spec in specs.items() if spec is not None}
 
 
-def parse_goal(text: str) -> GoalSpec:
-    """Read a goal in one of `FORMS`; UserError, with the forms, for any other text."""
+def parse_goal(text: str, keys: Mapping[str, str] | None = None) -> GoalSpec:
+    """Read a goal in one of `FORMS`; `keys`, for episode sets, as for `EpisodeSet`.
+
+    UserError, with the forms: any other text.
+    """
     kind, _, value = text.strip().partition(":")
     value = value.strip()
     episode = re.fullmatch(r"(.+)#(\d+)", value)
@@ -242,9 +247,9 @@ def parse_goal(text: str) -> GoalSpec:
     if kind == "image" and value:
         return GoalPicture(Path(value))
     if kind == "episode" and episode:
-        return EpisodeEnd(Path(episode[1]), int(episode[2]))
+        return EpisodeEnd(Path(episode[1]), int(episode[2]), keys or {})
     if kind == "bank" and value:
-        return Bank(Path(value))
+        return Bank(Path(value), keys or {})
     if kind == "goal" and value:
         return GoalFile(Path(value))
     if kind == "text" and value.partition("|")[0].strip():

@@ -20,9 +20,9 @@ from touchgoal.runtime.option_types import (
 from touchgoal.sim_envs.cell.deployment import AS_DEPLOYED, IDEAL_DEPLOYMENT, DeploymentConfig
 from touchgoal.sim_envs.scene.objects import CATALOGUE
 from touchgoal.sim_envs.scene.objects import find as find_object
+from touchgoal.sim_envs.scene.surroundings import USUAL, Surroundings
 from touchgoal.sim_envs.scene.wires import PER_FAMILY, TRAINED, Family, Split, Wire, choose
 from touchgoal.sim_envs.scene.wires import find as find_wire
-from touchgoal.sim_envs.surroundings import USUAL, Surroundings
 
 Outcome = Literal[
     "success",

@@ -16,9 +16,11 @@ import touchgoal
 from touchgoal.control import features as ft
 from touchgoal.episodes.faults import find_faults, leave_out_faulty
 from touchgoal.episodes.format import remote, set_files
+from touchgoal.episodes.keys import parse_keys
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
+from touchgoal.rewards.goals import EpisodeEnd, parse_goal
 from touchgoal.runtime.errors import UserError
 
 TOP = "observation.images.top"
@@ -104,6 +106,14 @@ def test_a_video_that_is_too_short_or_of_another_rate(foreign: Path) -> None:
         episodes.read(2, [TOP])
     write_video(path, toy_frames(0, 75)[TOP], 30)
     assert "30 frames per second" in find_faults(EpisodeSet(foreign), [0], [TOP])[0]
+
+
+def test_keys_rename_features_of_a_set_and_of_goals(foreign: Path) -> None:
+    keys = parse_keys([f"{TOP}={ft.FRONT}"])
+    assert {TOP, ft.FRONT} & EpisodeSet(foreign, keys=keys).features.keys() == {ft.FRONT}
+    goal = parse_goal(f"episode:{foreign}#0", keys)
+    assert isinstance(goal, EpisodeEnd) and goal.read([ft.FRONT]).frames[ft.FRONT].ndim == 4
+    assert ft.FRONT not in EpisodeSet(foreign).features, "another set is not affected"
 
 
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], np.float32)

@@ -8,7 +8,7 @@ import pytest
 from touchgoal.control.features import FRONT
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.surroundings import Surroundings
+from touchgoal.sim_envs.scene.surroundings import Surroundings
 
 SIZE = 256
 

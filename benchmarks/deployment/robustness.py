@@ -13,8 +13,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.scene.objects import NEW_KINDS
+from touchgoal.sim_envs.scene.surroundings import Surroundings
 from touchgoal.sim_envs.scene.wires import HELD_OUT
-from touchgoal.sim_envs.surroundings import Surroundings
 
 _LIGHT = {
     f"light {change:+.0%}": {"light_change": (change,)} for change in (-0.15, -0.05, 0.1, -0.8)

@@ -1,6 +1,6 @@
 """Touches by the wand, read as training data: pictures, views, objects and sentences."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,9 +17,12 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
 
-def is_wand_set(root: Path) -> bool:
-    """Whether a folder holds touches of the wand; UserError if it holds no set."""
-    episodes = EpisodeSet(root)
+def is_wand_set(root: Path, keys: Mapping[str, str] | None = None) -> bool:
+    """Whether a folder holds touches of the wand; UserError if it holds no set.
+
+    `keys` as for `EpisodeSet`.
+    """
+    episodes = EpisodeSet(root, keys=keys)
     return bool(len(episodes)) and ft.WAND_VIEWS[0] in episodes.features
 
 

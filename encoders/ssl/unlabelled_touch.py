@@ -1,6 +1,6 @@
 """Sources of a training without labels: episode sets, published recordings, videos, or several."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,9 +65,12 @@ class _Source:
 
 
 def open_touch(
-    data: Sequence[Path], validation: Sequence[Path], sensor: str | None
+    data: Sequence[Path],
+    validation: Sequence[Path],
+    sensor: str | None,
+    keys: Mapping[str, str] | None = None,
 ) -> UnlabelledTouch:
-    """Open folders of one sensor.
+    """Open folders of one sensor; `keys`, for episode sets, as for `EpisodeSet`.
 
     Recordings that a folder of `data` holds out are added to the validation data.
 
@@ -81,9 +84,9 @@ def open_touch(
                 f"--data and --validation are both {folder}: validate on episodes that are not trained "
                 "on; where a folder holds recordings out, leave --validation out"
             )
-    first = _open(data[0], sensor)
-    train = [first, *(_open(folder, first.sensor) for folder in data[1:])]
-    other = [_open(folder, first.sensor) for folder in validation]
+    first = _open(data[0], sensor, keys)
+    train = [first, *(_open(folder, first.sensor, keys) for folder in data[1:])]
+    other = [_open(folder, first.sensor, keys) for folder in validation]
     for source in train:
         if not other and not source.chosen(held_out=True):
             raise UserError(
@@ -119,10 +122,10 @@ def _require_no_overlap(train: Sequence[_Source], other: Sequence[_Source]) -> N
     )
 
 
-def _open(folder: Path, sensor: str | None) -> _Source:
+def _open(folder: Path, sensor: str | None, keys: Mapping[str, str] | None) -> _Source:
     folder = local_folder(folder)
     if (folder / "meta").exists():
-        episodes = EpisodeSet(folder)
+        episodes = EpisodeSet(folder, keys=keys)
         return _Source(folder, find_sensor_name(sensor, episodes), episodes)
     if labelled := has_labels(folder):
         found = read_labelled_videos(folder)

@@ -1,27 +1,18 @@
 """Start of a training run: checks before any data are read, the run's folder, its provenance."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from touchgoal.encoders.training.checkpoint import check_run_folder
-from touchgoal.encoders.training.options import SetTrainerOptions, TrainerOptions
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
-from touchgoal.episodes.keys import use_keys
 from touchgoal.episodes.overlap import require_no_shared_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import provenance
 from touchgoal.runtime.run_folder import open_run
-
-
-def check_training(options: SetTrainerOptions, out: Path | None) -> None:
-    """Check the options of a training before data are read, and apply --keys to all later sets.
-
-    UserError: malformed keys, or as for `check_run`.
-    """
-    use_keys(options.keys)
-    check_run(options, out)
 
 
 def check_run(options: TrainerOptions, out: Path | None) -> None:
@@ -48,8 +39,10 @@ def open_training(config: Any, command: str) -> Path:
     return open_run(config.out, command, config, adds=config.resume)
 
 
-def open_sets(data: Path, validation: Path) -> tuple[EpisodeSet, EpisodeSet]:
-    """Open the training and the validation set.
+def open_sets(
+    data: Path, validation: Path, keys: Mapping[str, str]
+) -> tuple[EpisodeSet, EpisodeSet]:
+    """Open the training and the validation set; `keys` as for `EpisodeSet`.
 
     UserError: they are the same, share frames, or are damaged.
     """
@@ -57,7 +50,7 @@ def open_sets(data: Path, validation: Path) -> tuple[EpisodeSet, EpisodeSet]:
         raise UserError(
             f"--data and --validation are both {data}: validate on episodes that are not trained on"
         )
-    sets = EpisodeSet(data), EpisodeSet(validation)
+    sets = EpisodeSet(data, keys=keys), EpisodeSet(validation, keys=keys)
     require_no_shared_frames(*sets)
     return sets
 

@@ -8,8 +8,9 @@ from touchgoal.encoders.alignment.wand_set import WandSet, is_wand_set
 from touchgoal.encoders.annotation.touches import open_annotations
 from touchgoal.encoders.ssl.frames import find_sensor_name
 from touchgoal.encoders.towers.towers import load_towers
-from touchgoal.encoders.training.run import check_training, open_sets, open_training, recipe
+from touchgoal.encoders.training.run import check_run, open_sets, open_training, recipe
 from touchgoal.encoders.training.trainer import is_first_process
+from touchgoal.episodes.keys import parse_keys
 from touchgoal.episodes.touches import collect_touches
 from touchgoal.launch.support.align_options import Align
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
@@ -22,8 +23,9 @@ from touchgoal.runtime.provenance import provenance
 
 def align_touch(config: Align) -> None:
     """Check episodes, touches of the wand or annotations, and align a touch encoder on them."""
-    check_training(config, config.out)
-    if config.data.suffix != ".jsonl" and is_wand_set(config.data):
+    check_run(config, config.out)
+    keys = parse_keys(config.keys)
+    if config.data.suffix != ".jsonl" and is_wand_set(config.data, keys):
         _align_wand(config)
         return
     if config.validation is None:
@@ -31,7 +33,7 @@ def align_touch(config: Align) -> None:
     if config.data.suffix == ".jsonl":
         _align_annotated(config, config.validation)
         return
-    data, validation = open_sets(config.data, config.validation)
+    data, validation = open_sets(config.data, config.validation, keys)
     sensor = find_sensor_name(config.sensor, data, validation)
     successes = [i for i in range(len(data)) if data.meta(i).get("success") is True]
     if not successes:

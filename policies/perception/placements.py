@@ -17,7 +17,7 @@ from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import WORKSPACE, Hand, PickPlace
-from touchgoal.sim_envs.surroundings import USUAL, UsualScene, draw_surroundings
+from touchgoal.sim_envs.scene.surroundings import USUAL, UsualScene, draw_surroundings
 
 MOST = 4  # objects on the table
 _ALONE = 0.4  # share of the placements with one object

@@ -1,6 +1,6 @@
 """Episodes of a set as trajectories."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -41,22 +41,28 @@ class EpisodeTrajectory(Trajectory):
             yield self.episodes.read(self.index, self.keys, frames)
 
 
-def open_episodes(root: Path, camera: str, index: Sequence[int], with_touch: bool) -> Source:
+def open_episodes(
+    root: Path,
+    camera: str,
+    index: Sequence[int],
+    with_touch: bool,
+    keys: Mapping[str, str] | None = None,
+) -> Source:
     """Open chosen episodes of a set, all of them by default.
 
     UserError: no such camera or episode, mixed sensors, fingertips that are not the sensor's or
     change places, or no episode left that can be measured.
     """
-    episodes = EpisodeSet(root, complete=False)
+    episodes = EpisodeSet(root, complete=False, keys=keys)
     _check_index(episodes, index)
     chosen = list(index or range(len(episodes)))
     touch = tuple(key for key in TACTILE if with_touch and key in episodes.features)
     camera = _find_camera(episodes, camera, bool(touch))
     cameras = tuple(key for key in dict.fromkeys((*CAMERAS, camera)) if key in episodes.features)
-    keys = tuple(
+    read = tuple(
         key for key in (*cameras, *touch, TRUTH_CONTACT, WRENCH) if key in episodes.features
     )
-    found = _trajectories(episodes, chosen, keys)
+    found = _trajectories(episodes, chosen, read)
     sensors = {str(t.meta["sensor"]) for t in found if t.meta.get("sensor")}
     if len(sensors) > 1:
         raise UserError(f"{root} mixes the sensors {', '.join(sorted(sensors))}: choose --index")
@@ -65,7 +71,7 @@ def open_episodes(root: Path, camera: str, index: Sequence[int], with_touch: boo
         seen = {chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)}
         if readable := [i for i in sorted(seen) if _reads(episodes, i, touch)]:
             check_fingertips(episodes, readable)
-    faults = find_faults(episodes, chosen, keys)
+    faults = find_faults(episodes, chosen, read)
     faults |= {
         t.index: f"{t.source} has one frame: a curve needs at least 2"
         for t in found

@@ -1,7 +1,7 @@
 """Open the source of trajectories that a user names."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ def open_source(
     index: Sequence[int] = (),
     with_touch: bool = True,
     fps: float | None = None,
+    keys: Mapping[str, str] | None = None,
 ) -> Source:
     """Open a source; what it holds is read later.
 
@@ -33,6 +34,7 @@ def open_source(
             shows that does not say so in its name.
         index: which episodes of the set; none for all.
         fps: frames per second of folders of images; None for 20.
+        keys: new keys of features of an episode set, see `EpisodeSet`.
     """
     path = local_folder(path)
     if not path.exists():
@@ -48,21 +50,25 @@ def open_source(
         return open_videos(path, key, with_touch, fps)
     if fps is not None:
         raise UserError(f"{path} states its own frame rate: leave --fps out")
-    source = open_episodes(root, key, index, with_touch)
+    source = open_episodes(root, key, index, with_touch, keys)
     if root == path:
         return source
     return replace(source, summary=f"{path} is not a set of episodes; measuring the set {root}")
 
 
 def open_successes(
-    paths: Sequence[Path], camera: str, with_touch: bool, assume_success: bool
+    paths: Sequence[Path],
+    camera: str,
+    with_touch: bool,
+    assume_success: bool,
+    keys: Mapping[str, str] | None = None,
 ) -> list[Source]:
     """Open the successful episodes of one set, or several plain videos of successes.
 
     With `assume_success` episodes without a recorded outcome count. UserError: as `open_source`; no
     source, several sets, or sets and videos; fewer than two successes.
     """
-    sources = [open_source(path, camera, with_touch=with_touch) for path in paths]
+    sources = [open_source(path, camera, with_touch=with_touch, keys=keys) for path in paths]
     sets = [s for s in sources if isinstance(s.trajectories[0], EpisodeTrajectory)]
     if not sources or len(sets) > 1 or (sets and len(sources) > 1):
         raise UserError("give one set of episodes, or several videos")

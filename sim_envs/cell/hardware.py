@@ -16,7 +16,7 @@ from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
 from touchgoal.sim_envs.scene.contacts import ContactReader, PadContact
 from touchgoal.sim_envs.scene.objects import Body
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
-from touchgoal.sim_envs.surroundings import UsualScene
+from touchgoal.sim_envs.scene.surroundings import UsualScene
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
