@@ -110,10 +110,10 @@ def main(config: Config) -> None:
     print(report.depth_table(depths))
     for line in report.warnings(fitted, presses):
         print(line)
-    record = report.record(fitted, presses, errors, depths, len(test))
+    metrics = report.calibration_metrics(fitted, presses, errors, depths, len(test))
     source = {"source": config.source or str(config.presses), **provenance()}
-    save(fitted.calibration, out / "sensor_file", {**source, **record})
-    write_json(out / "metrics.json", record)
+    save(fitted.calibration, out / "sensor_file", {**source, **metrics})
+    write_json(out / "metrics.json", metrics)
     report.draw_held_out(judged, test, out / "held_out.png")
     write_picture(out / "lights.png", light_compass(fitted.calibration))
     print(f"sensor file: {out / 'sensor_file'}; pictures: {out / 'held_out.png'}, lights.png")

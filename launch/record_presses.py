@@ -49,7 +49,7 @@ def main(config: Config) -> None:
     """Record until the map is full, the recording ends or Ctrl-C; then fit."""
     from contextlib import closing, nullcontext
 
-    from touchgoal.control.calibration.press_recorder import PressRecorder, record
+    from touchgoal.control.calibration.press_recorder import PressRecorder, record_presses
     from touchgoal.control.calibration.press_set import MINIMUM, write_presses
     from touchgoal.control.sensors.fingertip_source import is_recorded, open_frames
     from touchgoal.control.sensors.live_picture import LivePicture
@@ -74,7 +74,7 @@ def main(config: Config) -> None:
     with closing(frames), nullcontext() if recorded else closing(LivePicture(config.port)) as live:
         if live is not None:
             print(f"live picture: {live.address}")
-        record(frames, recorder, live)
+        record_presses(frames, recorder, live)
     if not recorder.images:
         raise UserError(f"no press was recorded; the last hint was: {recorder.hint}")
     folder = out / "presses"

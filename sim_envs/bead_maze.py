@@ -88,7 +88,7 @@ class BeadMaze(FrankaTactileEnv):
         config = self.config
         chosen = with_options(BeadMazeReset(), options)
         if chosen.wire is not None:
-            wire = wires.find(chosen.wire)
+            wire = wires.find_wire(chosen.wire)
         else:
             drawn = config.chosen_wires()
             wire = drawn[rng.integers(len(drawn))]

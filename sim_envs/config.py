@@ -18,11 +18,17 @@ from touchgoal.runtime.option_types import (
     checked_dataclass,
 )
 from touchgoal.sim_envs.cell.deployment import AS_DEPLOYED, IDEAL_DEPLOYMENT, DeploymentConfig
-from touchgoal.sim_envs.scene.objects import CATALOGUE
-from touchgoal.sim_envs.scene.objects import find as find_object
+from touchgoal.sim_envs.scene.objects import CATALOGUE, find_object
 from touchgoal.sim_envs.scene.surroundings import USUAL, Surroundings
-from touchgoal.sim_envs.scene.wires import PER_FAMILY, TRAINED, Family, Split, Wire, choose
-from touchgoal.sim_envs.scene.wires import find as find_wire
+from touchgoal.sim_envs.scene.wires import (
+    PER_FAMILY,
+    TRAINED,
+    Family,
+    Split,
+    Wire,
+    choose,
+    find_wire,
+)
 
 Outcome = Literal[
     "success",

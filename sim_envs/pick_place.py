@@ -14,7 +14,7 @@ from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import PickPlaceConfig, PickPlaceReset
 from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene.build import VISUAL_GROUP
-from touchgoal.sim_envs.scene.objects import CATALOGUE, find, sample_body
+from touchgoal.sim_envs.scene.objects import CATALOGUE, find_object, sample_body
 
 Hand = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, " j"]]
 """Joints (rad) of an arm for objects at these positions on the table (m, base frame)."""
@@ -97,10 +97,10 @@ class PickPlace(FrankaTactileEnv):
         """Draw the object, its mass, the grasp force, the distractors, and where all of them go."""
         config = self.config
         chosen = with_options(PickPlaceReset(), options)
-        kinds = [find(name) for name in config.objects] or list(CATALOGUE.values())
+        kinds = [find_object(name) for name in config.objects] or list(CATALOGUE.values())
         kind = kinds[rng.integers(len(kinds))]
         if chosen.object is not None:
-            kind = find(chosen.object)
+            kind = find_object(chosen.object)
         mass, force = rng.uniform(*config.mass), rng.uniform(*config.grasp_force)
         self.grasp_force = force if chosen.grasp_force is None else chosen.grasp_force
         self.asked = chosen.asked or kind.name

@@ -13,7 +13,7 @@ from touchgoal.sim_envs.bead_maze import BeadMaze, add_bead_on_wire, add_wire
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.scene import wires
-from touchgoal.sim_envs.scene.wires import FAMILIES, LENGTH, MIN_RADIUS, Wire, choose, find
+from touchgoal.sim_envs.scene.wires import FAMILIES, LENGTH, MIN_RADIUS, Wire, choose, find_wire
 
 BLIND = BeadMazeConfig(tactile=False)
 STILL = np.zeros(8)
@@ -57,7 +57,7 @@ def test_wires_are_sound_and_differ(family) -> None:
         lengths = np.linalg.norm(np.diff(wire.points, axis=0), axis=1)
         np.testing.assert_allclose(lengths, wires.STEP, rtol=1e-3)
         assert wire.min_radius > MIN_RADIUS and np.abs(wire.tangents[:, 2]).max() < 0.57
-        np.testing.assert_array_equal(find(wire.name).points, wire.points)
+        np.testing.assert_array_equal(find_wire(wire.name).points, wire.points)
     turned = drawn[0].moved(np.array([0.4, 0.1, 0.2]), 0.7)  # counts as the same wire
     assert wires.distance(wires.shape(turned), shapes[:1]) < 1e-6
 
@@ -100,20 +100,20 @@ def test_expert_leads_the_bead_to_the_end(maze: BeadMaze, family) -> None:
 @pytest.mark.parametrize("bead", ["sphere", "cylinder"])
 def test_expert_comes_back_when_led_astray(bead) -> None:
     env = BeadMaze(replace(BLIND, disturbance=0.004, bead=bead))
-    ticks = lead(env, BeadMazeExpert, find("roller-3"))
+    ticks = lead(env, BeadMazeExpert, find_wire("roller-3"))
     force = np.linalg.norm([tick[ft.WRENCH][:3] for tick in ticks], axis=1)
     assert ticks[-1][ft.TRUTH_SUCCESS] and 5 < force.max() < TASK_FORCES[env.task].force_ceiling
 
 
 def test_it_takes_touch(maze: BeadMaze) -> None:
     """The follower finishes, of the held-out family too; blind or misled, it does not."""
-    other = lead(maze, follower, find("helix-6"), seed=1)
+    other = lead(maze, follower, find_wire("helix-6"), seed=1)
     wrenches = [tick[ft.WRENCH] for tick in other]
     for name in ("fourier-3", "serpentine-5"):
-        assert lead(maze, follower, find(name))[-1][ft.TRUTH_SUCCESS]
+        assert lead(maze, follower, find_wire(name))[-1][ft.TRUTH_SUCCESS]
     for forces in ([], wrenches):
         other_forces = FeelsSomethingElse(forces)
-        ticks = lead(maze, lambda _, actor=other_forces: actor, find("serpentine-5"))
+        ticks = lead(maze, lambda _, actor=other_forces: actor, find_wire("serpentine-5"))
         assert ticks[-1][ft.TRUTH_FAILURE].any()
         assert max(tick[ft.TRUTH_PROGRESS] for tick in ticks) < 0.6
 

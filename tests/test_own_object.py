@@ -8,7 +8,7 @@ import pytest
 from touchgoal.policies.evaluation.evaluate import evaluate
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
-from touchgoal.sim_envs.scene.objects import find, sample_body
+from touchgoal.sim_envs.scene.objects import find_object, sample_body
 from touchgoal.sim_envs.scene.own_object import read_hull
 
 _FACES = "124 143 578 586 156 162 348 387 137 175 268 284"
@@ -41,7 +41,7 @@ def test_what_cannot_be_grasped_or_read_is_refused(tmp_path: Path) -> None:
     text = tmp_path / "text.stl"
     text.write_text("solid x\nendsolid x\n")
     with pytest.raises(UserError, match="STL must be binary"):
-        find(str(text))
+        find_object(str(text))
     flat = tmp_path / "flat.obj"
     flat.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 3 4\n")
     with pytest.raises(UserError, match="is no solid mesh"):
@@ -51,7 +51,7 @@ def test_what_cannot_be_grasped_or_read_is_refused(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_expert_places_an_object_of_ones_own(tmp_path: Path) -> None:
     mesh = write_box(tmp_path / "my_bracket.obj", (0.10, 0.03, 0.06), 40.0)
-    kind = find(str(mesh))
+    kind = find_object(str(mesh))
     assert kind.descriptions == ("my bracket",)
     assert sample_body(kind, np.random.default_rng(0), 0.1).rest_height == pytest.approx(
         0.03, abs=1e-4

@@ -28,7 +28,7 @@ from touchgoal.episodes.touches import check_fingertips
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import NO_RANDOMIZATION
-from touchgoal.sim_envs.scene.objects import find, sample_body
+from touchgoal.sim_envs.scene.objects import find_object, sample_body
 from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
@@ -123,7 +123,7 @@ def test_presses_tell_a_mirror_that_the_untouched_gel_does_not_show(tmp_path: Pa
 
 
 def test_a_pressed_edge_is_no_tear() -> None:
-    block = sample_body(find("wooden_block"), np.random.default_rng(0), mass=0.05)
+    block = sample_body(find_object("wooden_block"), np.random.default_rng(0), mass=0.05)
     gel = sample_instance(GELSIGHT_MINI, np.random.default_rng(0), NO_RANDOMIZATION)
     untouched, stepped = render_untouched(gel, np.random.default_rng(0)), 0
     for y in np.arange(-0.0215, -0.0155, 0.0008):  # m; an edge lies across the pad, along its rows

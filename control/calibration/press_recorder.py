@@ -152,7 +152,9 @@ class PressRecorder:
         return f"at the {_PLACES[rows][row]}, {_SIDES[columns][column]}"
 
 
-def record(frames: Iterable[Picture], recorder: PressRecorder, live: LivePicture | None) -> None:
+def record_presses(
+    frames: Iterable[Picture], recorder: PressRecorder, live: LivePicture | None
+) -> None:
     """Feed the recorder until its map is full, the frames end, the sensor is lost, or Ctrl-C."""
     hint = ""
     try:

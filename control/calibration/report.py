@@ -157,7 +157,7 @@ def warnings(fitted: FittedCalibration, presses: PressSet) -> list[str]:
     return lines
 
 
-def record(
+def calibration_metrics(
     fitted: FittedCalibration,
     presses: PressSet,
     errors: dict[str, PictureErrors],

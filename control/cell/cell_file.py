@@ -8,7 +8,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from touchgoal.control.cell.checks import check
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.control.cell.config_file import explain, read_config
+from touchgoal.control.cell.config_file import first_mistake, read_config
 from touchgoal.runtime.errors import UserError
 
 EXAMPLES = Path(__file__).parent / "examples"
@@ -60,7 +60,7 @@ def read_cell_file(
                 raise UserError("--seed sets a simulated scene; leave it out on a real arm")
             cell = replace(cell, task=replace(cell.task, seed=seed))
     except ValidationError as error:
-        raise UserError(f"{path}: {explain(error, CellConfig)}") from error
+        raise UserError(f"{path}: {first_mistake(error, CellConfig)}") from error
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     return cell

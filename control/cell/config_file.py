@@ -38,10 +38,10 @@ def read_config(path: Path, kind: type[Config], name: str) -> Config:
         # By way of JSON, in which lists pass for tuples and nothing else is converted.
         return TypeAdapter(kind).validate_json(json.dumps(table, default=str), strict=True)
     except ValidationError as error:
-        raise UserError(f"{path}: {explain(error, kind)}") from error
+        raise UserError(f"{path}: {first_mistake(error, kind)}") from error
 
 
-def explain(error: ValidationError, kind: type) -> str:
+def first_mistake(error: ValidationError, kind: type) -> str:
     """Return the first mistake in a `kind` in one line; unknown keys first, often misspelt ones."""
     found = error.errors()
     unknown = [e for e in found if e["type"] == "unexpected_keyword_argument"]

@@ -104,7 +104,7 @@ def monomials(
     return np.stack([x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y])
 
 
-def shadow_depth(
+def calibrated_shadow_depth(
     calibration: SensorCalibration, surface: Map, pitch: float
 ) -> Float32[np.ndarray, "lights h w"]:
     """Return `gel.shadow_depth` (m) of a surface (m) of a pitch (m/px) for a sensor's lights.
@@ -119,7 +119,7 @@ def shadows(
     calibration: SensorCalibration, surface: Map, pitch: float
 ) -> Float32[np.ndarray, "lights h w"]:
     """Return the share of each light's full shadow, 0 to 1, on a surface (m) of a pitch (m/px)."""
-    depth = shadow_depth(calibration, surface, pitch)
+    depth = calibrated_shadow_depth(calibration, surface, pitch)
     return depth / (depth + np.float32(calibration.penumbra))
 
 

@@ -44,7 +44,7 @@ def load_table(root: Path, leave_out: str | None = None) -> pa.Table:
     UserError: a file is missing or broken, or their columns are not of one type.
     """
     names = set_files.episodes_files(root)
-    tables = [set_files.load_table(root, name, leave_out) for name in names]
+    tables = [set_files.read_parquet(root, name, leave_out) for name in names]
     try:
         return pa.concat_tables(tables, promote_options="permissive").combine_chunks()
     except pa.ArrowException as error:

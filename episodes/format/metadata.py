@@ -206,9 +206,9 @@ class SetMetadata:
         return cls(
             fps=info["fps"],
             features=info["features"],
-            tasks=tuple(set_files.load_table(root, set_files.TASKS)["task"].to_pylist()),
+            tasks=tuple(set_files.read_parquet(root, set_files.TASKS)["task"].to_pylist()),
             stats=set_files.load_json(root, set_files.STATS),
-            files=tuple(set_files.load_table(root, name) for name in names),
+            files=tuple(set_files.read_parquet(root, name) for name in names),
         )
 
 

@@ -150,7 +150,7 @@ def load_json(root: Path, name: str) -> dict[str, Any]:
         raise unreadable(root, name, error) from error
 
 
-def load_table(root: Path, name: str, leave_out: str | None = None) -> pa.Table:
+def read_parquet(root: Path, name: str, leave_out: str | None = None) -> pa.Table:
     """Read a Parquet file of a set, without the columns that begin with `leave_out`.
 
     UserError: the file is missing or broken.

@@ -125,7 +125,7 @@ _SIZES: dict[Shape, tuple[tuple[float, float], ...]] = {
 }
 
 
-def find(name: str) -> ObjectKind:
+def find_object(name: str) -> ObjectKind:
     """Return the catalogue's entry, or an object of one's own by its mesh file (.stl, .obj).
 
     UserError: an unknown name, which lists the names, or see `read_hull`.
@@ -150,10 +150,10 @@ def _own_kind(path: str) -> ObjectKind:
 
 def of_same_shape(name: str, among: Sequence[str]) -> str:
     """Return the next object with the shape of `name`; UserError if there is no other."""
-    alike = [other for other in among if find(other).shape == find(name).shape]
+    alike = [other for other in among if find_object(other).shape == find_object(name).shape]
     others = [*alike[alike.index(name) + 1 :], *alike[: alike.index(name)]]
     if not others:
-        raise UserError(f"same_shape needs a second {find(name).shape} beside {name}")
+        raise UserError(f"same_shape needs a second {find_object(name).shape} beside {name}")
     return others[0]
 
 

@@ -120,7 +120,7 @@ def make(family: Family, seed: int) -> Wire | None:
     return wire if wire.min_radius > MIN_RADIUS and wire.clearance > CLEARANCE else None
 
 
-def find(name: str) -> Wire:
+def find_wire(name: str) -> Wire:
     """Return the wire of a name such as helix-1; UserError if there is none."""
     family, _, seed = name.rpartition("-")
     if family not in FAMILIES or not seed.isdecimal():

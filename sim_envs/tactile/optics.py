@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numba import njit
 
-from touchgoal.control.tactile.sensor_calibration import shadow_depth
+from touchgoal.control.tactile.sensor_calibration import calibrated_shadow_depth
 from touchgoal.sim_envs.tactile.sensor_instance import COUNT_STEP, NOISE_MARGIN, SensorInstance
 
 HeightField = Float32[np.ndarray, "h w"]
@@ -103,7 +103,7 @@ def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.
         np.float32(1 / pitch),
         calibration.response,
         tuple(np.float32(a) for a in limits),
-        shadow_depth(calibration, surface, pitch),
+        calibrated_shadow_depth(calibration, surface, pitch),
         np.float32(calibration.penumbra),
         calibration.shadow,
         instance.illumination,
