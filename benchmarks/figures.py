@@ -180,20 +180,6 @@ def faults(metrics: Metrics) -> str:
     return f"{whole} of {len(rows)} keep all episodes; at rest within {max(rest):.2f} s"
 
 
-def stream(metrics: Metrics) -> str:
-    """Distances from the box and the limits."""
-    most = {k: max(row[k] for row in metrics["rows"]) for k in ("outside", "speed", "jerk")}
-    return (
-        f"{-1e3 * most['outside']:.1f} mm inside the box; {most['speed']:.0%} of the speed limit, "
-        f"{most['jerk']:.0%} of the jerk limit"
-    )
-
-
-def replay(metrics: Metrics) -> str:
-    """Largest distance of the tools."""
-    return f"{1e3 * max(row['tool'] for row in metrics['rows']):.2f} mm at most"
-
-
 _TACBENCH = {  # task -> metric, unit
     "force": ("mae_mn", "mN"),
     "slip": ("f1", "F1"),

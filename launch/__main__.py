@@ -21,7 +21,6 @@ COMMANDS = {
     "train-encoder": "train a touch encoder",
     "train-pose-estimator": "train the network that finds object and goal in a camera picture",
     "train-policy": "train a policy on recorded episodes",
-    "make-policy": "make a shipped policy again: recordings, corrections, training, choice",
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "costs and rewards along episodes or plain videos",
     "fit-normalizer": "fit the normalizer of reward-curves on successful episodes of your own",

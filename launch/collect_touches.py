@@ -63,14 +63,13 @@ def main(config: Any) -> None:
 
 def _simulate(config: Any) -> None:
     from touchgoal.control.tactile.sensor_models import find_sensor
-    from touchgoal.episodes.bench_recording import record_bench
     from touchgoal.episodes.format.set_files import INFO
+    from touchgoal.episodes.slide_recording import record_slides
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.episodes.wand.recording import record_touches
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.interruption import on_interruption
     from touchgoal.runtime.run_folder import open_run
-    from touchgoal.sim_envs.config import RigConfig
 
     if config.object or config.description or config.new_gel:
         raise UserError(
@@ -89,8 +88,7 @@ def _simulate(config: Any) -> None:
         if config.body == "wand":
             episodes = record_touches(root, sensor, config.seed, count, workers)
         else:
-            rig = RigConfig(sensor=sensor, seed=config.seed)
-            episodes = record_bench("catalogue slides", root, rig, count, workers)
+            episodes = record_slides(root, sensor, config.seed, count, workers)
     if recorded:
         print("nothing left to record:", end=" ")
     print(f"{len(episodes)} episodes, {sum(episodes.lengths)} images in {root}")

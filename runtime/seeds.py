@@ -48,7 +48,6 @@ POSE_TRAINING = SeedRange(4_000_000, 900_000)  # scenes that a pose estimator le
 POSE_VALIDATION = SeedRange(4_900_000, _STEP)
 POLICY_TEST = SeedRange(5_000_000, 1_000_000)  # benchmark policy-delay, bead-maze
 DEPLOY_TEST = SeedRange(6_000_000, 2_000_000)  # benchmark deploy
-REPLAY = SeedRange(8_000_000, 1_000_000)  # benchmark replay
 DEMO = SeedRange(9_000_000, 1_000_000)
 
 WIRES: dict[str, SeedRange] = {  # shapes of wires have seeds apart from the episodes'

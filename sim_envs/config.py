@@ -13,8 +13,6 @@ from touchgoal.runtime.option_types import (
     Fraction,
     NotNegative,
     Positive,
-    PositiveRange,
-    Seed,
     checked_dataclass,
 )
 from touchgoal.sim_envs.cell.deployment import AS_DEPLOYED, IDEAL_DEPLOYMENT, DeploymentConfig
@@ -61,8 +59,6 @@ an overgripped object can still be a success of the task.
 """
 TaskName = Literal["pick-place", "bead-maze", "fragile-carry"]
 Camera = Literal["front", "wrist"]
-Indenter = Literal["sphere", "sharp", "flat"]
-"""A probe of the indenter rig."""
 ObjectName = Annotated[str, AfterValidator(lambda name: find_object(name).name)]
 """A name of the catalogue of objects, or the mesh file of one's own."""
 WireName = Annotated[str, AfterValidator(lambda name: find_wire(name).name)]
@@ -366,20 +362,3 @@ ENVS: dict[TaskName, TaskConfig] = {
     "fragile-carry": FragileCarryConfig(),
 }
 """Environments in which policies are tried."""
-
-
-@checked_dataclass
-class RigConfig:
-    """Options of the indenter rig."""
-
-    sensor: str = "gelsight_mini_markers"
-    """Fingertip sensor: a name or the folder of a sensor file."""
-    indenters: tuple[Indenter, ...] = ("sphere", "sharp", "flat")
-    """Probes, used in turn."""
-    load: Annotated[PositiveRange, RARE] = (0.5, 5.0)
-    """Range of the normal load, N."""
-    shear_relief: bool = True
-    """Simulate that the gel piles up in front of what slides over it and sinks behind: the only
-    trace of shear without printed dots. Shipped encoders were trained without it."""
-    seed: Seed = 0
-    """Random seed of the sensor and of all strokes."""

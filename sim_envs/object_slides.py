@@ -1,35 +1,27 @@
 """Objects held against one fingertip sensor and slid and turned under it by hand.
 
 As in Sparsh's appendix C.5 the load is constant and the velocity changes every fraction of a
-second. Changes of the pose over five frames are drawn log-uniformly. Stick and slip are the
-indenter rig's, with torsion: a turn counts as the way along a ring of the patch's mean radius.
+second. Changes of the pose over five frames are drawn log-uniformly. A turn counts as the way along
+a ring of the patch's mean radius.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
-from touchgoal.sim_envs.config import RigConfig
-from touchgoal.sim_envs.indenter_rig import FRICTION, REST, rig_unit, stick_slip_force
-from touchgoal.sim_envs.scene.objects import (
-    CATALOGUE,
-    HARD,
-    Body,
-    Material,
-    ObjectKind,
-    Texture,
-    sample_body,
-)
+from touchgoal.sim_envs.scene.objects import CATALOGUE, Body, sample_body
 from touchgoal.sim_envs.tactile.forces import ForceField
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
-HeldObject = Literal["bar", "can"]
-HELD: tuple[HeldObject, ...] = ("bar", "can")
+FPS = 60  # pictures a second, a DIGIT's
+FRICTION = 0.6  # friction coefficient of an object on the gel
+LOAD = 0.5, 5.0  # N: range of the normal load
+REST = 6
+"""Untouched frames at the start: the first pair of frames, 5 apart, is untouched."""
 FRAMES = 60  # frames of a slide, after the untouched ones
 _SEGMENT = 6, 13  # frames of one velocity, half-open range
 _WINDOW = 5  # frames over which changes are drawn
@@ -50,26 +42,17 @@ class Slide:
     load: float  # normal load, N
 
 
-def simulate_slide(config: RigConfig, index: int) -> Slide:
-    """Simulate a slide of the bar or the can; config and index determine it."""
-    rng = np.random.default_rng([config.seed, index, 2])
-    load = float(rng.uniform(*config.load))
-    body, flat = _body(HELD[index % len(HELD)])
-    sensor = find_sensor(config.sensor)
-    return _slide(body, flat, load, sensor, rig_unit(config), config.shear_relief, rng)
-
-
-def simulate_catalogue_slide(config: RigConfig, index: int) -> Slide:
+def simulate_object_slide(sensor: str, seed: int, index: int) -> Slide:
     """Simulate one slide of an object of pick-and-place, any side of it, on a sensor of its own."""
-    sensor, rng = find_sensor(config.sensor), np.random.default_rng([config.seed, index, 5])
+    model, rng = find_sensor(sensor), np.random.default_rng([seed, index, 5])
     kinds = list(CATALOGUE.values())
     body = sample_body(kinds[index % len(kinds)], rng, _MASS)
-    load = float(rng.uniform(*config.load))
-    unit = sample_instance(sensor, rng)
-    return _slide(body, _random_side(rng), load, sensor, unit, config.shear_relief, rng)
+    load = float(rng.uniform(*LOAD))
+    unit = sample_instance(model, rng)
+    return slide(body, _random_side(rng), load, model, unit, True, rng)
 
 
-def _slide(
+def slide(
     body: Body,
     side: Float[np.ndarray, "3 3"],
     load: float,
@@ -78,7 +61,13 @@ def _slide(
     relief: bool,
     rng: np.random.Generator,
 ) -> Slide:
-    """Slide a body over a sensor with a load (N); `side` is its rotation at turn 0."""
+    """Slide a body over a sensor.
+
+    Args:
+        side: the body's rotation at turn 0.
+        load: normal force, N.
+        relief: whether the gel piles up in front of what slides over it.
+    """
     pose = _draw_poses(rng)
     bench = PressBench(body, sensor, unit, relief)
     depth = -load / sensor.normal_stiffness
@@ -106,6 +95,26 @@ def _slide(
     return Slide(np.stack(frames), wrench, slides, whole, body.kind.name, load)
 
 
+def stick_slip_force(
+    places: Float[np.ndarray, "t d"], stiffness: float, limits: Float[np.ndarray, " t"] | float
+) -> tuple[Float[np.ndarray, "t d"], Bool[np.ndarray, " t"]]:
+    """Return forces (N) on a gel of `stiffness` N/m under an object at these places (m), and slip.
+
+    The gel's rest position is dragged along where the force would exceed the limit (N) of the frame.
+    `places`: x, y and, for turns, angle times the patch's mean radius; the third force is torsion
+    over that radius.
+    """
+    rest = places[0].astype(float)
+    force, slip = np.zeros(places.shape), np.zeros(len(places), bool)
+    for i, limit in enumerate(np.broadcast_to(limits, len(places))):
+        force[i] = stiffness * (places[i] - rest)
+        size = float(np.linalg.norm(force[i]))
+        if size > limit:
+            force[i] *= limit / size
+            rest, slip[i] = places[i] - force[i] / stiffness, True
+    return force, slip
+
+
 def mean_radius(field: ForceField) -> float:
     """Return the mean distance of the load from its centre, m."""
     y, x = np.indices(field.normal.shape)
@@ -130,15 +139,6 @@ def _draw_poses(rng: np.random.Generator) -> Float[np.ndarray, "t 3"]:
         pose[i] = pose[i - 1] + velocity
         left -= 1
     return pose
-
-
-def _body(held: HeldObject) -> tuple[Body, Float[np.ndarray, "3 3"]]:
-    """Return the object, and its rotation on the gel at turn 0."""
-    material = Material(Texture.SMOOTH, 0.0, 1e-3, HARD, FRICTION, (0.6, 0.6, 0.6, 1.0))
-    if held == "bar":
-        return Body(ObjectKind(held, "box", material, ()), (4e-3, 1.5e-3, 4e-3), _MASS), np.eye(3)
-    lying = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # its axis along the sensor's x
-    return Body(ObjectKind(held, "cylinder", material, ()), (8e-3, 3.5e-3), _MASS), lying
 
 
 def _random_side(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:

@@ -50,7 +50,6 @@ NOT_RUN = {
     "arm": "needs an arm: test_deploy.py",
     "push": "needs a hub: test_hub.py",
     "pull": "needs a hub: test_hub.py",
-    "make-policy": "test_commands.py",
     "demo": "test_commands.py",
 }
 

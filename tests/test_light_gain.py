@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.real_touch.picture_force import change_statistics
 from touchgoal.control import features as ft
 from touchgoal.control.calibration.ball import find_circle
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector, contact_strength
 from touchgoal.control.tactile.depth import DepthEstimator
-from touchgoal.control.tactile.force import change_statistics
 from touchgoal.control.tactile.indentation import IndentationMeter
 from touchgoal.control.tactile.light_gain import (
     LARGE_CHANGE,

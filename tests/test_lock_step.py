@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,17 +12,23 @@ import pytest
 from in_process import run_benchmark
 from running_twin import RunningTwin
 
-from benchmarks.deployment.replay import replay_both
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.cell_file import EXAMPLES
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import connect_cell
 from touchgoal.control.cell.twin_client import connect_control_port, reset_scene
+from touchgoal.control.interfaces import ArmReading
+from touchgoal.control.motion.tracker import ServoLag
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.safety.limits import Box, RobotLimits
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import main
-from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.cell.deployed_arm import measurements_at_rest
+from touchgoal.sim_envs.cell.deployment import DeploymentConfig
+from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
 
 _TICKS = 8
 _SMALL = "--env.objects wooden_block --env.cameras front --env.camera-size 96 96".split()
@@ -67,14 +74,87 @@ def test_a_lock_step_twin_gives_the_same_run_to_the_last_bit(tmp_path: Path) -> 
         assert twin.ask("truth")["time"] > left_at
 
 
+def wave(env: PickPlace) -> list[np.ndarray]:
+    """Joint changes that swing, each joint at its own rate."""
+    rng = np.random.default_rng(0)
+    rate, phase = rng.uniform(0.3, 1.0, 7), rng.uniform(0, 2 * np.pi, 7)
+    times = np.arange(0, 2.0, 1 / ft.CONTROL_HZ)
+    return [0.012 * np.sin(2 * np.pi * rate * t + phase) * min(1.0, t) for t in times]
+
+
+def press(env: PickPlace) -> list[np.ndarray]:
+    """A slow descent onto the table, to 0.5 mm below its top; a faster one triggers the reflex."""
+    q = env.command.copy()
+    tool, (position, R) = env.robot.tool, env.kinematics.forward(q)
+    corners = position + (np.array(tool.finger_corners) - [0, 0, tool.tcp_offset]) @ R.T
+    drop, actions = corners[:, 2].min(), []
+    low = np.linspace(drop - 0.005, drop + 5e-4, 50)
+    for depth in [*np.linspace(0, drop - 0.005, 50), *low, *[low[-1]] * 10]:
+        wanted = env.kinematics.solve_ik_near(position - [0, 0, depth], R, q).q
+        actions.append(wanted - q)
+        q = wanted
+    return actions
+
+
+def able_to_press(robot: RobotLimits) -> RobotLimits:
+    box = robot.fingertips
+    return replace(robot, fingertips=Box(np.array([*box.lower[:2], -0.02]), box.upper))
+
+
+def over_the_wire(cell: CellConfig, actions: list[np.ndarray]) -> list[ArmReading]:
+    connection = connect_cell(cell, ft.CONTROL_HZ)
+    robot, arm, seen = able_to_press(connection.robot), connection.arm, []
+    safety, lag = ActionFilter(robot, ft.CONTROL_HZ), ServoLag(robot, 1 / ft.CONTROL_HZ)
+    state = safety.start(arm.read().q)
+    with closing(connection):
+        for action in actions:
+            step = lag.update(action.astype(np.float32).astype(np.float64))
+            state = safety.filter_action(state, step, measurements_at_rest(state.q))
+            arm.command(state.q)
+            connection.gripper.command(0.0)
+            connection.clock.wait(connection.clock.now() + 1 / ft.CONTROL_HZ)
+            seen.append(arm.read())
+    return seen
+
+
 @pytest.mark.slow
-def test_the_same_actions_lead_to_the_same_place_in_the_environment_and_over_the_wire() -> None:
+def test_the_same_actions_lead_to_the_same_place_in_the_environment_and_over_the_wire(
+    tmp_path: Path,
+) -> None:
     pytest.importorskip("franky", reason=FRANKY.install)
-    wave, press = replay_both(seed=seeds.REPLAY.start)
-    for row in (wave, press):
-        assert row["joints"] < 0.01 and row["tool"] < 2e-3  # rad, m
-    assert wave["force here"] == 0 and press["force here"] > 5
-    assert press["force there"] == pytest.approx(press["force here"], rel=0.2)
+    none, delay, seed = (0.0, 0.0), (0.005, 0.005), 1  # s from a command to the arm on the wire
+    late = DeploymentConfig(
+        command_delay=delay, state_delay=none, jitter=none, estimated_wrench=False
+    )
+    task = PickPlaceConfig(objects=("wooden_block",), cameras=(), as_deployed=True, deployment=late)
+    env = PickPlace(task)
+    env.robot = able_to_press(env.robot)
+    options = [
+        "--lock-step",
+        "--no-wrench-error",
+        "--env.objects",
+        "wooden_block",
+        "--seed",
+        str(seed),
+    ]
+    with closing(RunningTwin(options, tmp_path, 5)) as twin:
+        cell = replace(twin.cell, cameras={}, fingertips=None)
+        for motion in (wave, press):
+            env.reset(seed=seed)
+            actions, here, force = motion(env), [], []
+            for action in actions:
+                env.step(np.append(action, 0.0).astype(np.float32))
+                here.append(env.kinematics.forward(env.joints()[0])[0])
+                force.append(np.linalg.norm(env.external_wrench()[:3]))
+            seen = over_the_wire(cell, actions)
+            there = [env.kinematics.forward(arm.q)[0] for arm in seen]
+            assert np.linalg.norm(np.subtract(here, there), axis=1).max() < 2e-3  # m
+            pressing = np.array(force) > 1.0  # N
+            assert pressing.any() == (motion is press)
+            if motion is press:
+                wired = [np.linalg.norm(arm.wrench[:3]) for arm in seen]
+                here, there = (np.median(np.array(f)[pressing]) for f in (force, wired))
+                assert here > 5 and there == pytest.approx(here, rel=0.2)
 
 
 @pytest.mark.parametrize("address", ["", "127.0.0.1:1"])

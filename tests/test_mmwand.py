@@ -10,25 +10,18 @@ import pytest
 import torch
 from in_process import in_process_workers, run_benchmark
 
-from benchmarks.papers.mmwand import classification, retrieval
-from benchmarks.papers.mmwand.real import dome_set, dome_tables, zero_shot
+from benchmarks.papers.mmwand.real import zero_shot
+from benchmarks.published_touch.objectfolder_real import (
+    read_objectfolder_real,
+    read_touches,
+)
+from benchmarks.published_touch.tvl import read_tvl
 from touchgoal.control import features as ft
 from touchgoal.encoders.alignment.splits import SPLITS, split_touches
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.whitening.surface_words import surface_ranks
-from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
-    read_objectfolder_real,
-    read_touches,
-)
-from touchgoal.episodes.importers.touch_sets.tvl import read_tvl
-from touchgoal.episodes.importers.touch_sets.vt60 import (
-    inside_dome,
-    is_vt60,
-    outside_dome,
-    read_vt60,
-)
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.episodes.wand import recording as wand_recording
@@ -120,7 +113,7 @@ def test_the_benchmarks_run(
     command += f" --out {tmp_path / 'run'} --encoders gelsight_mini --seeds 1"
     command += " --trained efficientnet"
     command += " --heads.epochs 2 --epochs 1" if name == "retrieval" else " --trained-epochs 1"
-    assert main([*command.split(), "--splits", "sample", "press"]) in (0, None)
+    run_benchmark(*command.split(), "--splits", "sample", "press")
     printed = capsys.readouterr().out
     assert "published" in printed and "raw pixels" in printed and "gelsight_mini" in printed
     rows = json.loads((tmp_path / "run/metrics.json").read_text())["rows"]
@@ -128,9 +121,6 @@ def test_the_benchmarks_run(
     named = {row.get("row", row.get("input")) for row in rows}
     assert "efficientnet trained" in named
     assert (name == "retrieval") == ("efficientnet trained, without touch-text" in named)
-
-
-CLASSES, PER_CLASS, PER_OBJECT, VIEWS = 2, 4, 8, 4
 
 
 def write_table(path: Path, *rows: tuple[object, ...]) -> None:
@@ -142,77 +132,6 @@ def write_table(path: Path, *rows: tuple[object, ...]) -> None:
 def write_picture(path: Path, picture: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), picture.astype(np.uint8))
-
-
-@pytest.fixture(scope="module")
-def dome(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two classes, felt as a bright or a dark blob and seen as a green or a red square."""
-    root, rng = tmp_path_factory.mktemp("vt60"), np.random.default_rng(0)
-    untouched = np.full((128, 128, 3), 120.0)
-    write_picture(root / "untouched.jpg", untouched)
-    objects, touches = [("object", "class")], [("file", "object")]
-    for kind in range(CLASSES):
-        for k in range(PER_CLASS):
-            name = f"{'ab'[kind]}_{k}"
-            objects.append((name, "ab"[kind]))
-            for i in range(PER_OBJECT):
-                picture = untouched + rng.normal(0, 1, untouched.shape)
-                at = tuple(int(v) for v in rng.integers(50, 70, 2))
-                cv2.circle(picture, at, 12, (190 - 140 * kind,) * 3, -1)
-                write_picture(root / "touch" / name / f"{i}.jpg", picture)
-                touches.append((f"touch/{name}/{i}.jpg", name))
-            for i in range(VIEWS):
-                view = rng.normal(128, 5, (64, 64, 3))
-                view[16:48, 16:48, 1 + kind] = 250
-                write_picture(root / "views" / name / f"{i}.jpg", view)
-    write_table(root / "objects.csv", *objects)
-    write_table(root / "touches.csv", *touches)
-    return root
-
-
-def test_the_dome_set_is_read(dome: Path, tmp_path: Path) -> None:
-    data = read_vt60(dome)
-    assert is_vt60(dome) and not is_vt60(tmp_path)
-    assert data.names[5] == "b_1" and data.classes == ("a", "b") and data.kind[5] == 1
-    assert len(data.touches) == CLASSES * PER_CLASS * PER_OBJECT
-    for path, k in zip(data.views, data.view_object, strict=True):
-        assert path.parent.name == data.names[k]
-    assert not outside_dome(128, 128)[inside_dome(128, 128)].any()
-    write_table(tmp_path / "objects.csv", ("object", "class"), ("a", "b"))
-    write_table(tmp_path / "touches.csv", ("file", "object"), ("touch/a/0.jpg", "a"))
-    with pytest.raises(UserError, match=r"untouched\.jpg, which is not there"):
-        read_vt60(tmp_path)
-
-
-@pytest.mark.parametrize("split", dome_tables.SPLITS)
-def test_every_row_is_tested_once_never_trained_on(dome: Path, split: dome_set.DomeSplit) -> None:
-    data = read_vt60(dome)
-    found = list(dome_set.folds(data, split, 0))
-    tested = np.concatenate([fold.test_touch for fold in found])
-    assert sorted(tested) == list(range(len(data.touches)))
-    for fold in found:
-        assert not set(fold.train_touch) & set(fold.test_touch)
-        assert not set(fold.train_view) & set(fold.test_view)
-        train = {*data.touch_object[fold.train_touch], *data.view_object[fold.train_view]}
-        test = {*data.touch_object[fold.test_touch], *data.view_object[fold.test_view]}
-        assert split != "object" or not train & test
-        assert set(data.kind[list(test)]) == {0, 1}
-
-
-def test_touch_finds_sight_of_unseen_objects(dome: Path, tmp_path: Path) -> None:
-    """Classes that differ by touch and sight are found; light outside the dome, which is equal, is not."""
-    result = retrieval.run(retrieval.Config(data=dome, cache=tmp_path))
-    rows = {(row["split"], row["input"]): row for row in result["rows"]}
-    direction = "touch to image"
-    assert rows["object", dome_set.SHIPPED][direction][0] > 99
-    assert rows["object", dome_set.PIXELS][direction][0] > 99
-    chance = rows["object", "chance"][direction][0]
-    assert chance < 70 and rows["object", dome_set.OUTSIDE][direction][0] < 80
-    assert "raw pixels" in result["table"]
-    classified = classification.run(classification.Config(data=dome, cache=tmp_path))["rows"]
-    [shipped] = [row for row in classified if row["input"] == dome_set.SHIPPED]
-    assert shipped["both"][0] == 100
-    assert len(list(tmp_path.glob("dome-*.npz"))) == 1  # embedded once
 
 
 def test_objectfolder_real(tmp_path: Path) -> None:

@@ -20,11 +20,11 @@ from published_files import (
     write_slides,
 )
 
-from touchgoal.episodes.importers.feeling_of_success import read_grasps
+from benchmarks.published_touch.feeling_of_success import read_grasps
+from benchmarks.published_touch.tacbench_forces import read_strokes
+from benchmarks.published_touch.tacbench_poses import read_bags
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
-from touchgoal.episodes.importers.tacbench_forces import read_strokes
-from touchgoal.episodes.importers.tacbench_poses import read_bags
 from touchgoal.runtime.errors import UserError
 
 

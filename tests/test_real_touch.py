@@ -8,19 +8,19 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.published_touch.force_grasps import read_force_grasps
 from benchmarks.real_touch import forces, markers
 from benchmarks.real_touch.embedders import find_embedder
-from benchmarks.real_touch.videos import Config, run
-from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
-from touchgoal.encoders.pretrained import load_encoder
-from touchgoal.encoders.probes import property_probe
-from touchgoal.encoders.probes.property_probe import (
+from benchmarks.real_touch.property_probe import (
     adapted_nearest_is_same,
     nearest_is_same,
     sentences_right,
 )
+from benchmarks.real_touch.videos import Config, run
+from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
+from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.probes import property_probe
 from touchgoal.encoders.towers.towers import OfflineTowers
-from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video
 from touchgoal.launch.__main__ import main

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 from in_process import in_process_workers
-from published_files import write_force_batch
 
+from benchmarks.papers.tacbench.attentive import AttentivePooler
 from benchmarks.papers.tacbench.benchmark import run
 from benchmarks.papers.tacbench.config import Config
 from benchmarks.papers.tacbench.data import STRIDE, RigFrames, read_strokes
@@ -16,19 +16,19 @@ from benchmarks.papers.tacbench.force import field_metrics, force_metrics
 from benchmarks.papers.tacbench.labels import label_metrics
 from benchmarks.papers.tacbench.slip import f1_score, slip_metrics
 from benchmarks.papers.tacbench.task import split_force, split_slip
+from benchmarks.papers.tacbench_rig.config import RigConfig, rig_unit
+from benchmarks.papers.tacbench_rig.recording import record_bench
+from benchmarks.papers.tacbench_rig.strokes import simulate
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import save
-from touchgoal.encoders.probes.attentive import AttentivePooler
 from touchgoal.encoders.ssl.frames import sample_frames
-from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.config import RigConfig
-from touchgoal.sim_envs.indenter_rig import REST, rig_unit, simulate, stick_slip_force
+from touchgoal.sim_envs.object_slides import REST, stick_slip_force
 
 RIG = RigConfig(seed=3)
 STROKES = 15
@@ -185,19 +185,3 @@ def test_metrics_of_labels_and_fields_by_hand() -> None:
     half[:, :, 20, 20] = 100.0
     assert field_metrics(half[None], field, np.arange(2))["shear_explained"] == pytest.approx(0.75)
     assert field_metrics(0 * half[None], field, np.arange(2))["pressure_explained"] == 0
-
-
-def test_published_files_are_benchmarked(here: Path) -> None:
-    for probe in ("sphere", "sharp", "flat"):
-        write_force_batch(here / "files" / probe / "batch_1", strokes=5)
-    options = Config(
-        tasks=("force", "slip"), encoders=("end-to-end:tiny",), shares=(1.0,), data=here / "files",
-        strokes=15, seeds=1, end_to_end_steps=2, end_to_end_batch_size=4, workers=1,
-    )  # fmt: skip
-    before = sorted((here / "files").rglob("*"))
-    result = run(options)
-    assert {row["task"] for row in result["rows"]} == {"force", "slip"}
-    assert f"published files in {here / 'files'}: digit" in result["table"]
-    assert sorted((here / "files").rglob("*")) == before  # nothing is written there
-    with pytest.raises(UserError, match="is not for pose: choose --tasks force slip"):
-        run(replace(options, tasks=("force", "pose")))

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.papers.tacbench_rig.config import RigConfig, rig_unit
+from benchmarks.papers.tacbench_rig.held_slides import simulate_slide
 from touchgoal.control.tactile.markers.tracker import MarkerTracker
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, GELSIGHT_MINI, SensorModel
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as DOTTED
-from touchgoal.sim_envs.config import NO_RANDOMIZATION, PickPlaceConfig, RigConfig
+from touchgoal.sim_envs.config import NO_RANDOMIZATION, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
-from touchgoal.sim_envs.indenter_rig import REST, rig_unit
-from touchgoal.sim_envs.object_slides import simulate_slide
+from touchgoal.sim_envs.object_slides import REST
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
 from touchgoal.sim_envs.tactile.optics import colour_change

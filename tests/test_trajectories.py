@@ -5,7 +5,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.deployment.sent_stream import late_by, outside_box, send, wild_commands
 from touchgoal.control.motion.arm_models import UR5E_ARM, JointLimits
 from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics
 from touchgoal.control.motion.rotations import fingers_down
@@ -21,6 +20,7 @@ from touchgoal.control.safety import limits as robots
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3, UR5E, RobotLimits
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.cell.deployed_arm import measurements_at_rest
 
 ROBOTS = [
     (robots.FR3, Fr3Kinematics()),
@@ -139,14 +139,34 @@ def test_a_regular_policy_is_followed_without_ripple() -> None:
     assert (late < 0.1).all()
 
 
+def wild_commands(layer: ActionFilter, ticks: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """The filtered joint targets (rad) of a policy that pushes anywhere, often very hard."""
+    state, push, commands = layer.start(layer.limits.arm.home), np.zeros(0), []
+    for tick in range(ticks):
+        if tick % round(1.25 / layer.dt) == 0:
+            push = rng.choice([0.05, 1.0, 1e300]) * rng.standard_normal(state.q.size)
+        state = layer.filter_action(state, push, measurements_at_rest(state.q))
+        commands.append(state.q)
+    return commands
+
+
+def outside_box(layer: ActionFilter, q: np.ndarray) -> float:
+    """How far (m) flange or fingers leave their boxes at worst; negative inside."""
+    points, limits = layer.monitored_points(q), layer.limits
+    boxes = (limits.flange, points[:, :1]), (limits.fingertips, points[:, 1:])
+    return max(float(np.maximum(box.lower - p, p - box.upper).max()) for box, p in boxes)
+
+
 @pytest.mark.parametrize("robot", [FR3, UR5E], ids=lambda r: r.arm.name)
 @pytest.mark.parametrize("hz", [20, 125])
 def test_what_is_sent_stays_in_the_box_and_inside_every_limit(robot: RobotLimits, hz: int) -> None:
     """A wild policy, a third of whose commands come late by up to a tick."""
     layer, rng = ActionFilter(robot, hz), np.random.default_rng(1)
-    commands = wild_commands(layer, 4 * hz, rng)
-    late = late_by(4 * hz, 1000 // hz, rng)
-    q = np.array(list(send(robot, hz, commands, late.tolist())))
+    period, commands = 1000 // hz, wild_commands(layer, 4 * hz, rng)
+    late = rng.integers(0, period, 4 * hz) * (rng.random(4 * hz) < 0.3)
+    lasting = period + np.diff(late, append=0)  # ms that each command stands
+    home = (robot.arm.home, int(late[0]))
+    q = track(robot, [home, *zip(commands, lasting.tolist(), strict=True)], hz)
     check_within(robot.interface, q)
     assert outside_box(layer, q[::5]) < 0
 

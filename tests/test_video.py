@@ -1,6 +1,5 @@
 """Cameras over a real MJPEG stream, real files and USB: newest frame, rate, stall, freeze, return, replug."""
 
-import itertools
 import os
 import re
 import threading
@@ -16,8 +15,7 @@ from numbered_pictures import BITS, numbered, until
 
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors import video
-from touchgoal.control.sensors.fingertip_source import fingertip_video
-from touchgoal.control.sensors.picture_integrity import BrokenBlocks, FrozenParts, JpegDecoder
+from touchgoal.control.sensors.picture_integrity import FrozenParts
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
     GELSIGHT_MINI_CROP,
@@ -145,61 +143,6 @@ def test_a_part_that_stands_still_counts_as_frozen_and_a_dark_part_does_not() ->
             picture[120:180] = noisy(39)[120:180]
         since = parts.update(picture, k / 30)
         assert since == pytest.approx((39 if k >= 40 else k) / 30, abs=1e-9)
-
-
-def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """A JPEG with twenty bytes of its picture replaced."""
-    broken = bytearray(data)
-    start = broken.index(b"\xff\xda") + 14
-    for _ in range(20):
-        broken[rng.integers(start, len(broken) - 2)] = rng.integers(256)
-    return bytes(broken)
-
-
-@pytest.mark.parametrize(
-    ("model", "real"),
-    [(GELSIGHT_MINI, "mini_presses/ball*.png"), (GELSIGHT_MINI_MARKERS, "mini_markers/*.png")],
-    ids=["plain", "dots"],
-)
-def test_broken_jpegs_are_refused_and_real_changes_are_not(model: SensorModel, real: str) -> None:
-    """Random bytes; decoders show them as blocks, which read as millimetres of indentation."""
-    clips = [[noisy(k, model) for k in range(30)]]
-    found = [cv2.imread(str(path)) for path in sorted(REAL.glob(real))]
-    clips += [[picture for picture in found if picture is not None]] * bool(found)
-    dots = fingertip_video("http://left", model).dots
-    decoder, rng = JpegDecoder(), np.random.default_rng(0)
-
-    def is_broken(image: np.ndarray, before: np.ndarray) -> bool:
-        blocks = BrokenBlocks(dots)
-        blocks.update(before)
-        return blocks.update(image)
-
-    for clip in clips:
-        sent, whole = [], []
-        for quality in (75, 95):
-            options = [cv2.IMWRITE_JPEG_QUALITY, quality]
-            sent = [cv2.imencode(".jpg", picture, options)[1].tobytes() for picture in clip]
-            whole = [image for data in sent if (image := decoder.decode(data)) is not None]
-            assert len(whole) == len(sent)
-            assert not any(is_broken(image, before) for before, image in itertools.pairwise(whole))
-        passed = 0
-        for k in range(50):
-            i = k % (len(clip) - 1)
-            blocks = BrokenBlocks(dots)
-            blocks.update(whole[i])
-            for _ in range(2):  # the second damage is not that of the first
-                image = decoder.decode(damaged(sent[i + 1], rng))
-                if image is not None and not blocks.update(image):
-                    change = np.abs(image.astype(np.float32) - whole[i + 1])
-                    passed += cv2.blur(change, (8, 8)).max() > 20
-        assert passed <= 5  # in 100 with visible damage; without the checks it is half
-
-
-def test_a_straight_edge_on_a_block_border_is_refused_only_once() -> None:
-    blocks, edge = BrokenBlocks(0), np.zeros_like(GEL)
-    edge[80:160, 96:224] = 30
-    blocks.update(noisy(0))
-    assert [blocks.update(cv2.add(noisy(k), edge)) for k in (1, 2, 3)] == [True, False, False]
 
 
 def test_a_lost_stream_is_joined_again(streamer: Streamer, camera: VideoCamera) -> None:

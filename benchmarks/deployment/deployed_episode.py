@@ -97,19 +97,16 @@ def _phase(episodes: Path, holding: bool) -> str:
 
 
 @contextmanager
-def deployed_twin(
-    scene: Scene, lock_step: bool, folder: Path, number: int, exact: bool = False
-) -> Iterator[Path]:
+def deployed_twin(scene: Scene, lock_step: bool, folder: Path, number: int) -> Iterator[Path]:
     """Run a twin with a scene and yield the cell file that it wrote.
 
-    Twins of different numbers run side by side. An exact one reports true forces, without an arm's
-    estimation error. UserError: the twin does not start.
+    Twins of different numbers run side by side. UserError: the twin does not start.
     """
     kind = "--env.wires" if scene.task == "bead-maze" else "--env.objects"
     command = [sys.executable, "-m", "touchgoal.launch", "twin", "--task", scene.task]
     command += [kind, scene.item, "--seed", str(scene.seed), "--port", "0", "--out", str(folder)]
     command += ["--host", own_address(100 + number % 100)]
-    command += [*["--lock-step"] * lock_step, *["--no-wrench-error"] * exact]
+    command += ["--lock-step"] * lock_step
     cell_file, end = folder / "cell.json", time.monotonic() + _START_TIMEOUT
     with (folder / "twin.log").open("w") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log)

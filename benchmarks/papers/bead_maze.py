@@ -16,6 +16,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.papers.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.control.features import Observation
 from touchgoal.encoders.backbones.sparsh import Method
 from touchgoal.encoders.pretrained import ENCODER_FORMAT
@@ -28,7 +29,6 @@ from touchgoal.policies.by_name import follower
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.evaluation import open_loop
 from touchgoal.policies.evaluation.evaluate import REFUSED, Trial, run_trials
-from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.heads.mlp import MLPConfig

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.options import BenchmarkOptions
+from benchmarks.published_touch.force_grasps import ForceGrasp, read_force_grasps
 from benchmarks.real_touch.embedders import Embedder, find_embedder
+from benchmarks.real_touch.picture_force import calibrate_force, change_statistics, resized
+from benchmarks.real_touch.property_probe import interval
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
-from touchgoal.control.tactile.force import calibrate_force, change_statistics, resized
 from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
-from touchgoal.encoders.probes.property_probe import interval
-from touchgoal.episodes.importers.force_grasps import ForceGrasp, read_force_grasps
 from touchgoal.rewards.features.contact_reading import ContactReader
 from touchgoal.rewards.metrics import spearman
 from touchgoal.runtime.option_types import RARE, Corners, Count, Seed, checked_dataclass

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.options import BenchmarkOptions
-from touchgoal.control.tactile.markers.tracker import MarkerTracker
-from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, MarkerGrid
-from touchgoal.episodes.importers.marker_pictures import (
+from benchmarks.published_touch.marker_pictures import (
     MarkerPicture,
     has_markers,
     read_marker_pictures,
 )
+from touchgoal.control.tactile.markers.tracker import MarkerTracker
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, MarkerGrid
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import RARE, Count, checked_dataclass
 from touchgoal.runtime.progress import track

@@ -201,7 +201,7 @@ def _tactile_camera(whole: CellConfig, cell: FingertipsSection, side: int) -> Ta
     model = find_sensor(cell.sensor_files[side] if cell.sensor_files else cell.sensor)
     corners = cell.corners[side] if cell.corners else None
     config = replace(
-        fingertip_video(source, model, corners),
+        fingertip_video(source, model),
         size=cell.size,
         rate=cell.rate or model.frame_rate,
         exposure=cell.exposure,

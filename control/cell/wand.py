@@ -136,7 +136,7 @@ def connect_wand(config: WandConfig) -> Wand:
 
 def _open_gel(own: GelSection) -> TactileCamera:
     model = find_sensor(own.sensor)
-    video = fingertip_video(own.source, model, own.corners)
+    video = fingertip_video(own.source, model)
     locked = replace(video, size=own.size, exposure=own.exposure, white_balance=own.white_balance)
     view = fingertip_view(model, own.source, own.border, own.corners)
     return TactileCamera(VideoCamera(locked), model, view)

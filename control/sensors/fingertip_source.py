@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from touchgoal.control.arrays import Picture
 from touchgoal.control.interfaces import DriverError
@@ -52,7 +51,7 @@ def open_frames(
     if is_recorded(source):
         yield from recorded_frames(Path(source), model, corners)
         return
-    video = fingertip_video(source, model, corners)
+    video = fingertip_video(source, model)
     locked = replace(video, exposure=exposure, white_balance=white_balance)
     view = fingertip_view(model, source, corners=corners)
     camera = TactileCamera(VideoCamera(locked), model, view)
@@ -73,17 +72,13 @@ def open_frames(
         camera.close()
 
 
-def fingertip_video(source: str, model: SensorModel, corners: Corners | None = None) -> VideoConfig:
+def fingertip_video(source: str, model: SensorModel) -> VideoConfig:
     """Describe a live source: a USB serial number, a device (/dev/video2) or a stream's address.
 
     A serial number is looked up at each opening: its device changes when it is plugged in again.
     """
-    view, dots = fingertip_view(model, source, corners=corners), 0.0
-    if model.markers is not None:
-        diagonal = model.pixel_pitch * float(np.hypot(*model.image_shape))  # m, of what is cut out
-        dots = model.markers.diameter / diagonal * (1 - 2 * view.border)
     device = None if "/" in source else lambda: find_sensor_camera(model, source).device
-    return VideoConfig(source, rate=model.frame_rate, gel=True, dots=dots, device=device)
+    return VideoConfig(source, rate=model.frame_rate, device=device)
 
 
 def recorded_frames(

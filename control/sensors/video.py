@@ -19,7 +19,7 @@ import numpy as np
 
 from touchgoal.control.interfaces import Frame
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.control.sensors.picture_integrity import BrokenBlocks, FrozenParts, JpegDecoder
+from touchgoal.control.sensors.picture_integrity import FrozenParts, JpegDecoder
 from touchgoal.runtime.errors import UserError
 
 _OPEN_TIMEOUT = 5.0  # s to open it the first time: the first frame may take longer to come
@@ -49,8 +49,6 @@ class VideoConfig:
     # number of identical pictures in a row that must also have come before they count as old; for a
     # lock-step twin, whose time is not the wall clock's
     frozen_pictures: int = 0
-    gel: bool = False  # a fingertip's: smooth but for its dots, so broken pictures show
-    dots: float = 0.0  # diameter of the printed dots as a share of the picture's diagonal; 0: none
     # looks `source` up at each opening, for a serial number
     device: Callable[[], str] | None = None
 
@@ -109,7 +107,6 @@ class VideoCamera:
             raise
         self._count = 0
         self._image: np.ndarray | None = None
-        self._broken_blocks = BrokenBlocks(config.dots) if config.gel else None
         self._frozen_parts, self._decoder = FrozenParts(), JpegDecoder()
         self._same, self._frozen = 0, False  # pictures in a row with an unchanged part
         self._lost = self._refused = ""
@@ -166,14 +163,12 @@ class VideoCamera:
             decoded = self._decoder.decode(image.tobytes())
         else:
             decoded = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        before, broken = self._image, decoded is None
-        refused = ""
-        if decoded is not None and before is not None and decoded.shape != before.shape:
+        before, self._refused = self._image, ""
+        if decoded is None:
+            self._refused = "sends broken pictures: check its cable"
+        elif before is not None and decoded.shape != before.shape:
             was, now = (f"{x.shape[1]}x{x.shape[0]}" for x in (before, decoded))
-            refused = f"sends {now} pixels instead of {was}: check that it is the same camera"
-        elif decoded is not None and self._broken_blocks is not None:
-            broken = self._broken_blocks.update(decoded)
-        self._refused = "sends broken pictures: check its cable" if broken else refused
+            self._refused = f"sends {now} pixels instead of {was}: check that it is the same camera"
         return None if self._refused else decoded
 
     def _reopen(self) -> None:

@@ -1,6 +1,5 @@
 """Linear probes: ridge regressions from frozen embeddings."""
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -26,21 +25,3 @@ def ridge_r2(
     read = ((test_inputs - mean) / spread).double() @ weights + offset
     error = ((read - test_targets) ** 2).mean(0)
     return (1 - error / test_targets.double().var(0, correction=0)).float()
-
-
-def ridge_scores(
-    inputs: Float[np.ndarray, "n d"],
-    targets: Float[np.ndarray, "n k"],
-    test_inputs: Float[np.ndarray, "m d"],
-    strength: float,
-) -> Float[np.ndarray, "m k"]:
-    """Predict targets by a ridge in its dual form, for fewer samples than columns.
-
-    Columns are brought to variance 1; `strength` is relative to the mean square of their rows.
-    """
-    mean, spread = inputs.mean(0), inputs.std(0) + 1e-6
-    known = (inputs - mean) / spread
-    kernel, width = known @ known.T / known.shape[1], len(known)
-    offset = targets.mean(0)
-    weights = np.linalg.solve(kernel + strength * np.eye(width), targets - offset)
-    return ((test_inputs - mean) / spread) @ known.T / known.shape[1] @ weights + offset

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from touchgoal.episodes.importers.touch_sets.tables import check_there, read_table
+from touchgoal.episodes.importers.tables import check_there, read_table
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.touches import touch_background
 from touchgoal.runtime.errors import UserError

@@ -23,7 +23,6 @@ from benchmarks.papers.mmwand.fine_tuned import (
     read_pictures,
 )
 from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
-from benchmarks.papers.mmwand.real.dome_tables import run_classification
 from benchmarks.papers.mmwand.trained import (
     Trainable,
     embed_touches,
@@ -36,7 +35,6 @@ from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
-from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 
 PUBLISHED = {
@@ -55,8 +53,7 @@ class Config(BenchmarkOptions):
     """Options of benchmark classification."""
 
     data: Path = field(kw_only=True)
-    """Touches recorded by `collect-touches --body wand`, or vt60's folder (real touches of a dome; it
-    uses its own networks and, of the options below, only `cache` and `seed`)."""
+    """Touches recorded by `collect-touches --body wand`."""
     encoders: tuple[str, ...] = ("gelsight_mini", "random:gelsight_mini")
     """Touch encoders: see benchmark real-touch."""
     splits: tuple[Literal["sample", "press"], ...] = ("sample", "press")
@@ -86,8 +83,6 @@ class Config(BenchmarkOptions):
 
 def run(config: Config) -> dict[str, Any]:
     """Fit probes and judge them."""
-    if is_vt60(config.data):
-        return run_classification(config.data, config.seed, config.cache)
     data = embed_set(config.data, config.encoders, config.seed, config.cache)
     image = data.image.mean(1)
     inputs = {"images": image, "raw pixels": _principal(data.pixels, config.seed)}

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from touchgoal.encoders.probes.property_probe import interval
+from benchmarks.real_touch.property_probe import interval
 
 Interval = tuple[float, float, float]  # mean and 95 % interval, %
 

@@ -22,13 +22,13 @@ from benchmarks.options import BenchmarkOptions
 from benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
 from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from benchmarks.papers.mmwand.real.captioned_set import embed_captioned
-from benchmarks.papers.mmwand.real.dome_tables import run_retrieval
 from benchmarks.papers.mmwand.trained import (
     Trainable,
     embed_fold,
     read_touch_data,
     train,
 )
+from benchmarks.published_touch.tvl import is_tvl
 from touchgoal.encoders.alignment.config import AlignConfig, HeadsConfig, Split
 from touchgoal.encoders.alignment.data import TouchData
 from touchgoal.encoders.alignment.heads import PairedEmbeddings, fit_heads
@@ -38,8 +38,6 @@ from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
-from touchgoal.episodes.importers.touch_sets.tvl import is_tvl
-from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.rewards.report.text_table import aligned
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
@@ -61,9 +59,8 @@ class Config(BenchmarkOptions):
     """Options of benchmark retrieval."""
 
     data: Path = field(kw_only=True)
-    """Touches recorded by `collect-touches --body wand`; TVL's folder, with ssvtp/ or hct/ (real touches
-    of a DIGIT; its captions stand for objects); or vt60's folder (real touches of a dome; it uses its own
-    networks and, of the options below, only `cache` and `seed`)."""
+    """Touches recorded by `collect-touches --body wand`; or TVL's folder, with ssvtp/ or hct/ (real
+    touches of a DIGIT; its captions stand for objects)."""
     encoders: tuple[str, ...] = ("gelsight_mini", "random:gelsight_mini")
     """Touch encoders: see benchmark real-touch."""
     splits: tuple[Split, ...] = SPLITS
@@ -91,8 +88,6 @@ Found = dict[str, tuple[Int[np.ndarray, " q"], Float[np.ndarray, " q"]]]
 
 def run(config: Config) -> dict[str, Any]:
     """Fit heads and judge retrieval, split by split."""
-    if is_vt60(config.data):
-        return run_retrieval(config.data, config.seed, config.cache)
     splits: tuple[Split, ...] = config.splits
     if is_tvl(config.data):
         if config.trained:

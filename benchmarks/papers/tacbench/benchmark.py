@@ -16,15 +16,14 @@ import torch
 
 from benchmarks.papers.tacbench import data, probes
 from benchmarks.papers.tacbench.config import RECORDED_AS, Config, Recording
-from benchmarks.papers.tacbench.published_recordings import check_tasks, find_published
 from benchmarks.papers.tacbench.task import Task
 from benchmarks.papers.tacbench.trainings import TASKS, Job, Subject, work
 from benchmarks.papers.tacbench_report.figures import draw_by_labels
 from benchmarks.papers.tacbench_report.tables import table
+from benchmarks.papers.tacbench_rig.recording import record_bench
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.preprocess import Preprocessor
-from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import on_interruption
@@ -54,28 +53,18 @@ class Bench:
 def run(config: Config) -> dict[str, Any]:
     """Record the bench, train every probe and judge it on test recordings."""
     sensor = find_sensor(config.rig.sensor).name
-    published = find_published(config.data, sensor) if config.data else None
-    if published is not None and config.data is not None:
-        check_tasks(published, config.data, config.tasks)
-        sensor = published.sensor
     encoders = {name: _encoder(name, sensor, config) for name in config.encoders}
     short = Path(config.rig.sensor).name  # also the name of a sensor file's folder
-    folder = Path("runs") / f"tacbench_{short}_{config.rig.seed}"
-    readings: dict[Recording, Reading]
-    if published is None:
-        folder = config.data or folder
-        recordings: dict[Recording, None] = dict.fromkeys(RECORDED_AS[t] for t in config.tasks)
-        readings = {what: _record(what, folder, config) for what in recordings}
-    else:
-        folder.mkdir(parents=True, exist_ok=True)
-        readings = {published.what: partial(published.read, getattr(config, published.what))}
+    folder = config.data or Path("runs") / f"tacbench_{short}_{config.rig.seed}"
+    recordings = dict.fromkeys(RECORDED_AS[task] for task in config.tasks)
+    readings: dict[Recording, Reading] = {w: _record(w, folder, config) for w in recordings}
     bench = Bench(config, sensor, folder, encoders)
-    kept = f"recordings are in {config.data or folder}; probes are not saved"
+    kept = f"recordings are in {folder}; probes are not saved"
     with on_interruption(lambda: kept):
         rows = [row for what, how in readings.items() for row in _run_recording(bench, what, how)]
     rows.sort(key=lambda row: config.tasks.index(row["task"]))
     return {
-        "table": table(rows, sensor, config, config.data if published else None),
+        "table": table(rows, sensor, config),
         "rows": rows,
         "pictures": {"by_labels": draw_by_labels(rows, sensor)},
     }

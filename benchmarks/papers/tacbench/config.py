@@ -6,11 +6,11 @@ from typing import Annotated, Literal, get_args
 from pydantic import Field
 
 from benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.papers.tacbench_rig.config import RigConfig
+from benchmarks.papers.tacbench_rig.recording import Recording
 from touchgoal.runtime.option_types import RARE, Count, Positive, Seed, checked_dataclass
-from touchgoal.sim_envs.config import RigConfig
 
 TacbenchTask = Literal["force", "field", "slip", "pose", "grasp", "textile"]
-Recording = Literal["strokes", "slides", "grasps", "cloths"]
 RECORDED_AS: dict[str, Recording] = {
     "force": "strokes",
     "field": "strokes",
@@ -50,9 +50,7 @@ class Config(BenchmarkOptions):
     cloths: Annotated[int, Field(ge=10)] = 600
     """Presses of 20 cloths in turn to simulate for T6."""
     data: Path | None = None
-    """Folder of the recordings; missing ones are made. Default: runs/tacbench_<sensor>_<seed>. A
-    folder of published files works instead: TacBench's force (--tasks force slip) or pose
-    estimation (pose), or Feeling of Success (grasp)."""
+    """Folder of the recordings; missing ones are made. Default: runs/tacbench_<sensor>_<seed>."""
     seeds: Count = 3
     """Training seeds of each row: labels drawn, initial weights, order."""
     seed: Seed = 0

@@ -9,15 +9,15 @@ import torch
 from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 
+from benchmarks.papers.tacbench_rig.cloths import CLOTHS
+from benchmarks.papers.tacbench_rig.config import RigConfig
+from benchmarks.papers.tacbench_rig.strokes import simulate
 from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import Preprocessor
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.config import RigConfig
-from touchgoal.sim_envs.indenter_rig import simulate
-from touchgoal.sim_envs.tactile.rig.cloths import CLOTHS
 
 STRIDE = 5  # frames between the two of a pair, as in Sparsh: 83 ms at the rig's 60 Hz
 _PRESSED_IS_POSITIVE = np.array([1, 1, -1], np.float32)
@@ -43,7 +43,6 @@ class RigFrames:
     label: Int[Tensor, " n"] | None = None  # grasp success, or number of the cloth
     field: Float[Tensor, "n 3 24 24"] | None = None  # shear along x and y, and pressure, kPa
     moments: int = 0  # frames of each finger of a grasp; 0 for recordings in time
-    use: Int[np.ndarray, " n"] | None = None  # published, see `task.Split`; None to assign one
 
     def stacked(self, rows: Rows, offsets: tuple[int, ...]) -> Float[Tensor, "k t 3 h w"]:
         """Return frames and those before each; a stroke's first frames repeat its first.
@@ -150,13 +149,10 @@ def _field(rig: RigConfig, index: int) -> Float32[np.ndarray, "t 3 24 24"]:
 
 
 def preprocessed(
-    pictures: UInt8[np.ndarray, "t h w 3"],
-    preprocess: Preprocessor,
-    background: UInt8[np.ndarray, "h w 3"] | None = None,
+    pictures: UInt8[np.ndarray, "t h w 3"], preprocess: Preprocessor
 ) -> Float16[Tensor, "t 3 H W"]:
-    """Preprocess pictures; their background is the first one if none is given."""
-    untouched = pictures[0] if background is None else background
-    return torch.from_numpy(preprocess(pictures, untouched)).half()
+    """Preprocess pictures; their background is the first one."""
+    return torch.from_numpy(preprocess(pictures, pictures[0])).half()
 
 
 def rows_before(lengths: list[int], stride: int) -> Rows:

@@ -6,11 +6,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from benchmarks.papers.tacbench.attentive import AttentiveProbe
 from benchmarks.papers.tacbench.data import RigFrames, Rows
+from benchmarks.papers.tacbench.dense import DenseProbe
 from benchmarks.papers.tacbench.task import Metrics, Outputs, Targets, split_force
-from touchgoal.encoders.probes.attentive import AttentiveProbe
-from touchgoal.encoders.probes.dense import DenseProbe
-from touchgoal.encoders.probes.property_probe import interval
+from benchmarks.real_touch.property_probe import interval
 
 _BETA = 0.02  # smooth L1 loss, in shares of the range, as Sparsh
 _TOUCHED = 10.0  # weight of pressed cells, which are few

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from benchmarks.papers.tacbench.attentive import AttentiveProbe
 from benchmarks.papers.tacbench.data import RigFrames, Rows
 from benchmarks.papers.tacbench.task import (
     Metrics,
@@ -17,9 +18,8 @@ from benchmarks.papers.tacbench.task import (
     split_grasp,
     split_textile,
 )
-from touchgoal.encoders.probes.attentive import AttentiveProbe
-from touchgoal.encoders.probes.property_probe import interval
-from touchgoal.sim_envs.tactile.rig.cloths import CLOTHS
+from benchmarks.papers.tacbench_rig.cloths import CLOTHS
+from benchmarks.real_touch.property_probe import interval
 
 
 class LabelTask:

@@ -6,10 +6,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from benchmarks.papers.tacbench.attentive import AttentiveProbe
 from benchmarks.papers.tacbench.data import RigFrames, Rows
 from benchmarks.papers.tacbench.task import Metrics, Outputs, Targets, split_pose
-from touchgoal.encoders.probes.attentive import AttentiveProbe
-from touchgoal.encoders.probes.property_probe import interval
+from benchmarks.real_touch.property_probe import interval
 
 SHIFT_BINS, TURN_BINS = (0.1, 0.5, 1.0, 2.0, 5.0), (0.03, 0.2, 0.5, 1.0, 2.0)
 """Bounds of the classes on either side of 0, mm and degrees, as Sparsh."""

@@ -6,11 +6,11 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from benchmarks.papers.tacbench.attentive import AttentiveProbe
 from benchmarks.papers.tacbench.data import RigFrames, Rows
 from benchmarks.papers.tacbench.task import Metrics, Outputs, Targets, split_slip
-from touchgoal.encoders.probes.attentive import AttentiveProbe
-from touchgoal.encoders.probes.property_probe import interval
-from touchgoal.sim_envs.indenter_rig import FRICTION
+from benchmarks.real_touch.property_probe import interval
+from touchgoal.sim_envs.object_slides import FRICTION
 
 _THRESHOLDS = 200
 

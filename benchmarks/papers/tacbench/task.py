@@ -117,9 +117,7 @@ def _split(frames: RigFrames, chosen: Bool[np.ndarray, " n"], test: str) -> Spli
 
 
 def _use(frames: RigFrames) -> Int[np.ndarray, " n"]:
-    """Assign 0 to 4 evenly over the recordings of each object, or as published."""
-    if frames.use is not None:
-        return frames.use
+    """Assign 0 to 4 evenly over the recordings of each object."""
     use = np.empty(len(frames.stroke), np.int64)
     for k, name in enumerate(np.unique(frames.indenter)):
         own = frames.indenter == name

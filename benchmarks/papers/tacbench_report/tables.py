@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from benchmarks.papers.tacbench.config import Config
@@ -78,14 +77,12 @@ LAYOUTS: dict[str, Layout] = {
 }
 
 
-def table(rows: list[Row], sensor: str, config: Config, published_in: Path | None = None) -> str:
-    """Return the table as text; `published_in` is the folder of real recordings, if any."""
+def table(rows: list[Row], sensor: str, config: Config) -> str:
+    """Return the table as text."""
     recorded = (
         f"simulated: {sensor}, {config.strokes} strokes, {config.slides} slides, {config.grasps} "
         f"grasps, {config.cloths} presses of cloth"
     )
-    if published_in is not None:
-        recorded = f"published files in {published_in}: {sensor}"
     trained = f"{config.seeds} training seed{'s' * (config.seeds > 1)}"
     lines = [f"TacBench, {recorded}, {trained}; [95 % over test recordings]"]
     for task in config.tasks:

@@ -16,11 +16,11 @@ from benchmarks.papers.mmwand.embedded_set import (
     small_change,
     touch_key,
 )
+from benchmarks.published_touch.tvl import CaptionedTouch, read_tvl
 from benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.control.arrays import Picture
 from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.episodes.importers.touch_clip import decode
-from touchgoal.episodes.importers.touch_sets.tvl import CaptionedTouch, read_tvl
 from touchgoal.runtime.progress import track
 
 _MEDIAN_OF = 50  # touches; enough that no pixel is touched in most of them

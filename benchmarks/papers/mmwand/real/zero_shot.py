@@ -17,15 +17,15 @@ from jaxtyping import Float
 from benchmarks.options import BenchmarkOptions
 from benchmarks.papers.mmwand.grasped_objects import run_grasped_objects
 from benchmarks.papers.mmwand.other_set import run_other_set
+from benchmarks.published_touch.objectfolder_real import (
+    read_objectfolder_real,
+    read_touches,
+)
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes.bootstrap import mean_interval
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.format import set_files
-from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
-    read_objectfolder_real,
-    read_touches,
-)
 from touchgoal.rewards.report.text_table import aligned
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass

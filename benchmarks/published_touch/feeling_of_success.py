@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.episodes.importers.labels import booleans, entry
+from benchmarks.published_touch.labels import booleans, entry
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import TouchClip, check_sensor, encoded_pictures
 from touchgoal.runtime.errors import UserError
@@ -49,11 +49,6 @@ def read_grasps(folder: Path, sensor: str | None = None) -> Iterator[GraspTrial]
     named = check_sensor(sensor, ("gelsight", "gelsight_markers"), folder)
     for path in paths:
         yield from _read(path, named)
-
-
-def is_grasp_set(folder: Path) -> bool:
-    """Return whether a folder holds files of these names."""
-    return bool(_files(folder))
 
 
 def _files(folder: Path) -> list[Path]:

@@ -12,18 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from benchmarks.papers.tacbench_rig.config import Indenter, RigConfig, rig_unit
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
-from touchgoal.sim_envs.config import Indenter, RigConfig
+from touchgoal.sim_envs.object_slides import FRICTION, REST, stick_slip_force
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Shape, Texture
 from touchgoal.sim_envs.tactile.forces import tractions
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
-from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
-FPS = 60  # pictures a second, a DIGIT's
-FRICTION = 0.6  # nominal friction coefficient, which references assume for all strokes
 FRICTION_SPREAD = 0.15  # largest relative deviation of a stroke's friction from `FRICTION`
-REST = 6
-"""Untouched frames at the start of a stroke: the first pair of frames, 5 apart, is untouched."""
 MAX_SLIDE = 2e-3  # m
 _PLACES = 3e-3  # m from the middle of the picture, along x and y
 _PRESS_FRAMES = 8, 16
@@ -67,31 +63,6 @@ def simulate(config: RigConfig, index: int) -> Stroke:
         wrenches.append(np.concatenate([bench.contact.force, bench.contact.torque]))
     wrench = np.array(wrenches, np.float32)
     return Stroke(np.stack(frames), wrench, slip, np.stack(fields), indenter, load.max(), friction)
-
-
-def rig_unit(config: RigConfig) -> SensorInstance:
-    """Draw the rig's sensor, the same one for all strokes of a config."""
-    return sample_instance(find_sensor(config.sensor), np.random.default_rng([config.seed, 0]))
-
-
-def stick_slip_force(
-    places: Float[np.ndarray, "t d"], stiffness: float, limits: Float[np.ndarray, " t"] | float
-) -> tuple[Float[np.ndarray, "t d"], Bool[np.ndarray, " t"]]:
-    """Return forces (N) on a gel of `stiffness` N/m under an object at these places (m), and slip.
-
-    The gel's rest position is dragged along where the force would exceed the limit (N) of the frame.
-    `places`: x, y and, for turns, angle times the patch's mean radius; the third force is torsion
-    over that radius.
-    """
-    rest = places[0].astype(float)
-    force, slip = np.zeros(places.shape), np.zeros(len(places), bool)
-    for i, limit in enumerate(np.broadcast_to(limits, len(places))):
-        force[i] = stiffness * (places[i] - rest)
-        size = float(np.linalg.norm(force[i]))
-        if size > limit:
-            force[i] *= limit / size
-            rest, slip[i] = places[i] - force[i] / stiffness, True
-    return force, slip
 
 
 def _draw_path(

@@ -7,14 +7,6 @@ from pathlib import Path
 from touchgoal.runtime.errors import UserError
 
 
-def has_columns(table: Path, columns: Iterable[str]) -> bool:
-    """Return whether a CSV file is there and its first line names these columns."""
-    if not table.is_file():
-        return False
-    with table.open(newline="", encoding="utf-8", errors="replace") as file:
-        return set(columns) <= set(next(csv.reader(file), []))
-
-
 def read_table(table: Path, columns: Iterable[str]) -> list[dict[str, str]]:
     """Read the rows of a CSV file; UserError if it is missing, empty or lacks a column."""
     if not table.is_file():

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from touchgoal.episodes.importers.tables import check_there, read_table
 from touchgoal.episodes.importers.touch_clip import read_picture_file
-from touchgoal.episodes.importers.touch_sets.tables import check_there, read_table
 from touchgoal.runtime.errors import UserError
 
 _COLUMNS = ("index", "name", "material")

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from touchgoal.episodes.importers.labels import booleans, entry, numbers, whole_numbers
+from benchmarks.published_touch.labels import booleans, entry, numbers, whole_numbers
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import TouchClip, check_sensor, read_pictures
 from touchgoal.runtime.errors import UserError
@@ -71,11 +71,6 @@ def read_strokes(folder: Path, sensor: str | None = None) -> Iterator[ForceStrok
         )
     for batch in batches:
         yield from _read_batch(batch, sensor)
-
-
-def is_force_set(folder: Path) -> bool:
-    """Return whether a folder holds batches of these files."""
-    return any(any(folder.glob(f"{depth}{_LABELS}")) for depth in ("", "*/", "*/*/"))
 
 
 def _shards(batch: Path) -> list[Path]:

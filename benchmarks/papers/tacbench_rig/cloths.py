@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from touchgoal.sim_envs.config import RigConfig
-from touchgoal.sim_envs.indenter_rig import rig_unit
+from benchmarks.papers.tacbench_rig.config import RigConfig, rig_unit
 from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface

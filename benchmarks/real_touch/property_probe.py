@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 
 from touchgoal.encoders.probes.bootstrap import percentile_interval
-from touchgoal.encoders.probes.ridge import ridge_scores
 from touchgoal.encoders.whitening.covariance import inverse_square_root, within_classes
 from touchgoal.encoders.whitening.text_head import EmbedTexts, fit_text_head, rank_sentences
 
@@ -166,5 +165,23 @@ def _ridge(
 ) -> Float[np.ndarray, "m properties ranks"]:
     """Return a score for each rank of each property."""
     targets = np.eye(N_RANKS)[ranks].reshape(len(ranks), -1)
-    scores = ridge_scores(embeddings, targets, test_embeddings, strength)
+    scores = _ridge_scores(embeddings, targets, test_embeddings, strength)
     return scores.reshape(len(test_embeddings), ranks.shape[1], N_RANKS)
+
+
+def _ridge_scores(
+    inputs: Float[np.ndarray, "n d"],
+    targets: Float[np.ndarray, "n k"],
+    test_inputs: Float[np.ndarray, "m d"],
+    strength: float,
+) -> Float[np.ndarray, "m k"]:
+    """Predict targets by a ridge in its dual form, for fewer samples than columns.
+
+    Columns are brought to variance 1; `strength` is relative to the mean square of their rows.
+    """
+    mean, spread = inputs.mean(0), inputs.std(0) + 1e-6
+    known = (inputs - mean) / spread
+    kernel, width = known @ known.T / known.shape[1], len(known)
+    offset = targets.mean(0)
+    weights = np.linalg.solve(kernel + strength * np.eye(width), targets - offset)
+    return ((test_inputs - mean) / spread) @ known.T / known.shape[1] @ weights + offset

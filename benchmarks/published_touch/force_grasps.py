@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from touchgoal.control.sensors.tactile_camera import rectify
 from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
-from touchgoal.episodes.importers.touch_sets.tables import check_there, read_table
+from touchgoal.episodes.importers.tables import check_there, read_table
 from touchgoal.episodes.media import read_frames
 from touchgoal.runtime.option_types import Corners
 

@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from benchmarks.papers.tacbench_rig.config import RigConfig
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
-from touchgoal.sim_envs.config import RigConfig, SceneConfig
+from touchgoal.sim_envs.config import SceneConfig
 from touchgoal.sim_envs.scene.build import SIDES, add_body, add_fingertip, set_options
 from touchgoal.sim_envs.scene.contacts import ContactReader
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body, sample_body
@@ -151,7 +152,7 @@ class _Hand:
 
 
 def _scene(body: Body, sensor: SensorModel) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec.from_file(str(Path(__file__).parent / "scene" / "grasp_rig.xml"))
+    spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name("grasp_rig.xml")))
     set_options(spec, SceneConfig())
     for side in SIDES:
         add_fingertip(spec, side, sensor)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from touchgoal.episodes.importers.labels import entry, numbers
+from benchmarks.published_touch.labels import entry, numbers
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import TouchClip, encoded_pictures, read_picture_file
 from touchgoal.runtime.errors import UserError
@@ -69,11 +69,6 @@ def read_bags(folder: Path) -> Iterator[PoseBag]:
         clip = TouchClip(str(path), "digit", pictures[:count])
         held_out = path.parent.parent.name == "test"
         yield PoseBag(str(path), path.parent.name, held_out, clip, change[:count], untouched)
-
-
-def is_pose_set(folder: Path) -> bool:
-    """Return whether a folder holds these files."""
-    return bool(_bags(folder))
 
 
 def _bags(folder: Path) -> list[Path]:
