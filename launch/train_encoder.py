@@ -19,6 +19,8 @@ from touchgoal.runtime.option_types import (
     checked_dataclass,
 )
 
+_GRASP_FRAMES = 24  # frames with contact taken from each episode of a grasp, both fingertips
+
 
 @checked_dataclass
 class _UnlabelledData:
@@ -124,8 +126,6 @@ class Words:
     """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local folder."""
     surfaces: Annotated[Count, RARE] = 2000
     """Random surfaces that teach roughness and bumpiness beside the objects."""
-    contact_frames: Annotated[Count, RARE] = 24
-    """Frames with contact taken from each episode of a grasp, both fingertips together."""
     backgrounds: str = "screen"
     """Background of the objects in the views: screen (the green screen, as recorded), generated, or a
     folder of pictures."""
@@ -258,7 +258,7 @@ def _add_words(config: Words) -> None:
     sets = [
         embed_wand(encoder, WandSet.open(root), towers, change)
         if root in of_wand
-        else embed_grasps(encoder, root, config.contact_frames, config.seed)
+        else embed_grasps(encoder, root, _GRASP_FRAMES, config.seed)
         for root in config.data
     ]
     surfaces = embed_surfaces(encoder, sensor, config.surfaces, config.seed)
@@ -269,7 +269,7 @@ def _add_words(config: Words) -> None:
             for root, own in zip(config.data, sets, strict=True)
         ],
         "surfaces": config.surfaces,
-        "contact_frames": config.contact_frames,
+        "contact_frames": _GRASP_FRAMES,
         "backgrounds": config.backgrounds,
         "heads": asdict(config.heads),
         "seed": config.seed,

@@ -19,6 +19,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 from touchgoal.runtime.provenance import provenance
 
+_CONTACT_FRAMES, _NO_CONTACT_FRAMES = 24, 8  # taken from each episode
+
 
 def align_touch(config: Align) -> None:
     """Check episodes, touches of the wand or annotations, and align a touch encoder on them."""
@@ -41,7 +43,7 @@ def align_touch(config: Align) -> None:
         )
     towers = load_towers(config.towers)
     out = open_training(config, "train-encoder")
-    drawn = config.contact_frames, config.no_contact_frames, config.seed
+    drawn = _CONTACT_FRAMES, _NO_CONTACT_FRAMES, config.seed
     train, val = (collect_touches(episodes, *drawn) for episodes in (data, validation))
     print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
     made_from = recipe(data, validation)
@@ -65,7 +67,7 @@ def _align_wand(config: Align) -> None:
         raise UserError(f"{config.data} holds touches of the wand: leave --validation out")
     data = WandSet.open(config.data)
     sensor, towers = find_sensor_name(config.sensor, data.episodes), load_towers(config.towers)
-    fold = split_touches(config.split, data.label, data.visit, data.describes, config.seed)
+    fold = split_touches("press", data.label, data.visit, data.describes, config.seed)
     out = open_training(config, "train-encoder")
     print(f"{len(fold.train)} touches of {len(data.names)} objects; {len(fold.test)} held out")
     source = {"data": str(config.data), "checksum": data.episodes.checksum, **provenance()}
