@@ -14,7 +14,6 @@ from touchgoal.launch.support.align_options import Align, Preset, presets
 from touchgoal.runtime.option_types import (
     RARE,
     Count,
-    Fraction,
     Seed,
     checked_dataclass,
 )
@@ -148,9 +147,6 @@ class Adapt:
     """Encoder to adapt: a name, or its folder."""
     towers: str = "offline"
     """Frozen towers for the sentences: offline, or a CLIP as Hugging Face id or local folder."""
-    share: Annotated[Fraction, RARE] = 0.1
-    """Weight of the videos' within-object covariance; the remainder comes from simulation. Chosen on
-    PhysiCLeAR's training objects, where 0.02 to 0.9 do equally well."""
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""
 
@@ -294,8 +290,8 @@ def _adapt(config: Adapt) -> None:
     videos = [video for video in every if video.split in ("train", "unlabelled")]
     towers = load_towers(config.towers)
     out = open_run(config.out, "train-encoder", config)
-    adapted = adapt(encoder, videos, config.share, towers)
-    source = {"data": str(config.data), "videos": len(videos), "share": config.share}
+    adapted = adapt(encoder, videos, towers)
+    source = {"data": str(config.data), "videos": len(videos)}
     save(adapted, out / "encoder", {"adapted_from": config.encoder, **source, **provenance()})
     objects = len({video.object for video in videos})
     print(f"{len(videos)} videos of {objects} objects; encoder: {out / 'encoder'}")

@@ -89,20 +89,18 @@ class SensorRandomization:
     0.39). The others: differences between published calibrations.
     """
 
-    gain: Annotated[NotNegative, Field(le=0.3)] = 0.047
-    """Standard deviation of each colour channel's gain."""
+    gain: Annotated[NotNegative, Field(le=0.3)] = (
+        0.047  # standard deviation of each colour channel's
+    )
+    # Standard deviations of a constant and of a smooth pattern added to the untouched image, of 255.
     offset: NotNegative = 2.4
-    """Standard deviation of a constant added to the untouched image, counts of 255."""
     pattern: NotNegative = 2.4
-    """Standard deviation of a smooth pattern added to the untouched image, counts of 255."""
-    azimuth: Annotated[NotNegative, Field(le=180)] = 15.0
-    """Largest rotation of each light around the gel, degrees."""
-    blur: Fraction = 0.3
-    """Largest relative change of the gel's smoothing of an imprint."""
-    pixel_pitch: bool = True
-    """Draw the millimetres per pixel from the sensor model's range."""
-    markers: Fraction = 0.1
-    """Largest shift of printed dots (share of their spacing) and relative change of their size."""
+    azimuth: Annotated[NotNegative, Field(le=180)] = 15.0  # largest turn of each light, degrees
+    blur: Fraction = 0.3  # largest relative change of the gel's smoothing of an imprint
+    pixel_pitch: bool = True  # draw the millimetres per pixel from the sensor model's range
+    markers: Fraction = (
+        0.1  # largest shift of dots, share of their spacing, and change of their size
+    )
 
 
 NO_RANDOMIZATION = SensorRandomization(

@@ -12,8 +12,8 @@ from in_process import in_process_workers, run_benchmark
 
 from benchmarks.papers.mmwand import classification, retrieval
 from benchmarks.papers.mmwand.real import dome_set, dome_tables, zero_shot
+from benchmarks.papers.mmwand.splits import SPLITS, split_touches
 from touchgoal.control import features as ft
-from touchgoal.encoders.alignment.splits import SPLITS, split_touches
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers

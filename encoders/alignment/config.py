@@ -6,9 +6,6 @@ from pydantic import Field
 
 from touchgoal.runtime.option_types import FIXED, Count, Positive, checked_dataclass
 
-Split = Literal["sample", "press", "object", "sentence"]
-"""What is held out of touches of the wand, see `splits`."""
-
 
 @checked_dataclass
 class Augmentation:

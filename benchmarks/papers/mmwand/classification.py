@@ -24,6 +24,7 @@ from benchmarks.papers.mmwand.fine_tuned import (
 )
 from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from benchmarks.papers.mmwand.real.dome_tables import run_classification
+from benchmarks.papers.mmwand.splits import Fold
 from benchmarks.papers.mmwand.trained import (
     Trainable,
     embed_touches,
@@ -31,7 +32,6 @@ from benchmarks.papers.mmwand.trained import (
     train,
 )
 from touchgoal.encoders.alignment.config import AlignConfig
-from touchgoal.encoders.alignment.splits import Fold
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.options import TrainerOptions
