@@ -42,8 +42,6 @@ class Config:
     """Share of the presses that is held out to measure the reported errors."""
     seed: Seed = 0
     """Random seed of the held-out choice."""
-    source: str = ""
-    """Origin of the presses, for the record; default: their folder."""
 
 
 def main(config: Config) -> None:
@@ -111,7 +109,7 @@ def main(config: Config) -> None:
     for line in report.warnings(fitted, presses):
         print(line)
     metrics = report.calibration_metrics(fitted, presses, errors, depths, len(test))
-    source = {"source": config.source or str(config.presses), **provenance()}
+    source = {"source": str(config.presses), **provenance()}
     save(fitted.calibration, out / "sensor_file", {**source, **metrics})
     write_json(out / "metrics.json", metrics)
     report.draw_held_out(judged, test, out / "held_out.png")

@@ -6,12 +6,12 @@ lets go, the distance to the goal is drawn: in the camera image, in touch, in bo
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from touchgoal.control.features import ACTION, CAMERAS, FRONT, IMAGE_PREFIX, TACTILE, TRUTH_CONTACT
+from touchgoal.control.features import ACTION, CAMERAS, FRONT, TACTILE, TRUTH_CONTACT
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.option_types import Seed, checked_dataclass
+from touchgoal.runtime.option_types import FIXED, Seed, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig
 
 if TYPE_CHECKING:
@@ -28,15 +28,12 @@ class Config:
     """Sentence that says how the object feels: the goal in words."""
     seed: Seed = seeds.DEMO.start
     """Random seed of the episode."""
-    env: PickPlaceConfig = PickPlaceConfig(objects=("glass_ball",), release=True)
-    """Options of the task; --env.objects names what to pick up."""
+    env: Annotated[PickPlaceConfig, FIXED] = PickPlaceConfig(objects=("glass_ball",), release=True)
 
     def __post_init__(self) -> None:
-        """Refuse options that leave nothing to measure."""
+        """Refuse a sentence that says nothing."""
         if not self.words.strip():
             raise UserError("--words is empty: say how the object feels")
-        if not self.env.tactile or FRONT.removeprefix(IMAGE_PREFIX) not in self.env.cameras:
-            raise UserError("the demo measures touch and the front camera: leave both on")
 
 
 def main(config: Config) -> None:
@@ -62,7 +59,7 @@ def main(config: Config) -> None:
     out = open_run(config.out, "demo", config)
 
     env, hz = PickPlace(config.env), config.env.control_hz
-    chosen = {"object": config.env.objects[0]} if len(config.env.objects) == 1 else {}
+    chosen = {"object": config.env.objects[0]}
     episode, pictures = record_with_film(env, EpisodeSpec(config.seed, options=chosen))
     env.close()
     held = until_release(episode)

@@ -16,7 +16,7 @@ from touchgoal.control.features import CONTROL_HZ
 from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import DeviceName
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.option_types import RARE, Count, Seed, checked_dataclass
+from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 
 if TYPE_CHECKING:
     from touchgoal.control.cell.config import CellConfig
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 STOPPED = 4  # exit status
 _LONGEST_PAUSE = 3600.0  # s between two demonstrations
+_CAMERA_SIZE = 256, 256  # rows and columns of the recorded camera images, px
 _SETTLE_TIME = 0.5  # s for which the arm comes to rest before a demonstration
 
 
@@ -49,8 +50,6 @@ class Config:
     seed: Seed | None = None
     """Random seed of the first scene, in place of the cell file's; each further one adds one (simulated
     arm or twin only)."""
-    camera_size: Annotated[tuple[Count, Count], RARE] = (256, 256)
-    """Rows and columns of the recorded camera images, px."""
     hand: TeleoperationConfig = TeleoperationConfig()
     """Response of the hand to the device."""
     yes: bool = False
@@ -158,7 +157,7 @@ def _record(
             make_actor=lambda loop: Teleoperator(device, safety, loop.commanded, config.hand),
             operator_request=lambda: terminal.operator_request() or device.verdict,
             on_tick=terminal.show_tick,
-            camera_size=config.camera_size,
+            camera_size=_CAMERA_SIZE,
         )
         with terminal.watching():
             keys = f"\n{HELP}" if config.device == "keyboard" else ""

@@ -14,10 +14,11 @@ from touchgoal.launch.support.align_options import Align, Preset, presets
 from touchgoal.runtime.option_types import (
     RARE,
     Count,
-    Fraction,
     Seed,
     checked_dataclass,
 )
+
+_GRASP_FRAMES = 24  # frames with contact taken from each episode of a grasp, both fingertips
 
 
 @checked_dataclass
@@ -124,8 +125,6 @@ class Words:
     """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local folder."""
     surfaces: Annotated[Count, RARE] = 2000
     """Random surfaces that teach roughness and bumpiness beside the objects."""
-    contact_frames: Annotated[Count, RARE] = 24
-    """Frames with contact taken from each episode of a grasp, both fingertips together."""
     backgrounds: str = "screen"
     """Background of the objects in the views: screen (the green screen, as recorded), generated, or a
     folder of pictures."""
@@ -148,9 +147,6 @@ class Adapt:
     """Encoder to adapt: a name, or its folder."""
     towers: str = "offline"
     """Frozen towers for the sentences: offline, or a CLIP as Hugging Face id or local folder."""
-    share: Annotated[Fraction, RARE] = 0.1
-    """Weight of the videos' within-object covariance; the remainder comes from simulation. Chosen on
-    PhysiCLeAR's training objects, where 0.02 to 0.9 do equally well."""
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""
 
@@ -260,7 +256,7 @@ def _add_words(config: Words) -> None:
     sets = [
         embed_wand(encoder, WandSet.open(root), towers, change)
         if root in of_wand
-        else embed_grasps(encoder, root, config.contact_frames, config.seed)
+        else embed_grasps(encoder, root, _GRASP_FRAMES, config.seed)
         for root in config.data
     ]
     surfaces = embed_surfaces(encoder, sensor, config.surfaces, config.seed)
@@ -271,7 +267,7 @@ def _add_words(config: Words) -> None:
             for root, own in zip(config.data, sets, strict=True)
         ],
         "surfaces": config.surfaces,
-        "contact_frames": config.contact_frames,
+        "contact_frames": _GRASP_FRAMES,
         "backgrounds": config.backgrounds,
         "heads": asdict(config.heads),
         "seed": config.seed,
@@ -296,8 +292,8 @@ def _adapt(config: Adapt) -> None:
     videos = [video for video in every if video.split in ("train", "unlabelled")]
     towers = load_towers(config.towers)
     out = open_run(config.out, "train-encoder", config)
-    adapted = adapt(encoder, videos, config.share, towers)
-    source = {"data": str(config.data), "videos": len(videos), "share": config.share}
+    adapted = adapt(encoder, videos, towers)
+    source = {"data": str(config.data), "videos": len(videos)}
     save(adapted, out / "encoder", {"adapted_from": config.encoder, **source, **provenance()})
     objects = len({video.object for video in videos})
     print(f"{len(videos)} videos of {objects} objects; encoder: {out / 'encoder'}")

@@ -7,12 +7,11 @@ moved, and the light changed, in most of them; the hand is elsewhere in half.
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig
-from touchgoal.runtime.option_types import RARE, Count, checked_dataclass
-from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.runtime.option_types import Count, checked_dataclass
+from touchgoal.sim_envs.config import CameraPlacement, PickPlaceConfig
 
 
 @checked_dataclass
@@ -26,11 +25,10 @@ class Config(TrainerOptions):
     placements: Count = 30
     """Renderings of each scene: objects moved and painted, some of them hidden."""
     train: PoseTrainConfig = PoseTrainConfig()
-    """Epochs, learning rate, noise."""
-    pose_estimator: Annotated[PoseEstimatorConfig, RARE] = PoseEstimatorConfig()
-    """Network of the pose estimator."""
-    env: Annotated[PickPlaceConfig, RARE] = PickPlaceConfig()
-    """Options of the rendered scenes."""
+    """Epochs and learning rate."""
+    front_camera: CameraPlacement | None = None
+    """The front camera as calibrate-camera measured yours, in the base frame: x y z (m), quaternion wxyz (z
+    looks ahead, y down), vertical field of view (degrees)."""
     workers: Count = os.cpu_count() or 1
     """Processes that render."""
 
@@ -39,7 +37,6 @@ def main(config: Config) -> None:
     """Render placements, train on them, measure the errors on other ones."""
     import torch
 
-    from touchgoal.control import features as ft
     from touchgoal.encoders.training.run import check_run, open_training
     from touchgoal.encoders.training.trainer import is_first_process
     from touchgoal.policies.perception.placements import Variety, render_placements
@@ -59,10 +56,13 @@ def main(config: Config) -> None:
     first_seed = seeds.POSE_TRAINING.first(config.scenes, "--scenes")
     out = open_training(config, "train-pose-estimator")
     torch.manual_seed(config.seed)
-    network, known = PoseEstimator(config.pose_estimator), provenance()
-    cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in config.pose_estimator.crops)
-    size = config.pose_estimator.size
-    env = replace(config.env, tactile=False, cameras=cameras, camera_size=size)
+    network, known = PoseEstimator(PoseEstimatorConfig()), provenance()
+    env = PickPlaceConfig(
+        tactile=False,
+        cameras=("front",),
+        camera_size=network.config.size,
+        front_camera=config.front_camera,
+    )
     rendered = render_placements(env, config.scenes, config.placements, first_seed, config.workers)
     train_pose_estimator(network, rendered, config.train, out, config, known)
     if not is_first_process():

@@ -97,33 +97,27 @@ class TrainConfig:
 class PoseEstimatorConfig:
     """Crops of the camera images, and sizes of the networks."""
 
-    size: tuple[Count, Count] = (256, 256)
-    """Rows and columns of the camera images, px. With half as many a pixel covers 5 mm of the
-    table, and objects are located to 3 mm at best."""
+    # Rows and columns of the camera images, px. With half as many a pixel covers 5 mm of the table,
+    # and objects are located to 3 mm at best.
+    size: tuple[int, int] = (256, 256)
+    # Crop of each camera's images that shows the table: column of the episodes, then rows and
+    # columns (from, to; from, to), px.
     crops: tuple[tuple[str, Box], ...] = ((ft.FRONT, (80, 256, 0, 256)),)
-    """Crop of each camera's images that shows the table: column of the episodes, then rows and
-    columns (from, to; from, to), px."""
-    scene_keypoints: Count = 16
-    """Keypoints of the whole image at half its size, which show how the camera stands."""
-    finder_channels: Count = 48
-    """Feature maps of the first look, which finds object and goal; cells of 8 x 8 pixels."""
-    look: Count = 64
-    """Side of the second look, a square around each of them, px. It must hold the largest object
-    where the first look is a cell off."""
-    channels: Count = 32
-    """Feature maps of the second look; each of their cells covers 4 x 4 pixels."""
-    dilations: tuple[Count, ...] = (1, 2, 4)
-    """Dilation of each further layer, cells. Together they must cover the largest object: its shape
-    shows its height."""
-    keypoints: Count = 16
-    """Keypoints of each image, found by a spatial softmax."""
-    keypoint_features: Count = 32
-    """Features of each keypoint."""
-    width: Count = 256
-    """Width of the hidden layers that combine them."""
+    scene_keypoints: int = 16  # of the whole image at half its size: how the camera stands
+    finder_channels: int = 48  # maps of the first look, for object and goal; cells of 8 x 8 px
+    # Side of the second look, a square around each of them, px. It must hold the largest object
+    # where the first look is a cell off.
+    look: int = 64
+    channels: int = 32  # feature maps of the second look, in cells of 4 x 4 px
+    # Dilation of each further layer, cells. Together they must cover the largest object: its shape
+    # shows its height.
+    dilations: tuple[int, ...] = (1, 2, 4)
+    keypoints: int = 16  # of each image, found by a spatial softmax
+    keypoint_features: int = 32  # of each keypoint
+    width: int = 256  # of the hidden layers that combine them
+    # Least share of the first look near the object and near the goal, and least length of the vector
+    # of the yaw, in which the estimate is trusted; training sets them.
     sure: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Least share of the first look near the object and near the goal, and least length of the vector
-    of the yaw, in which the estimate is trusted; training sets them."""
 
 
 @checked_dataclass
@@ -136,5 +130,3 @@ class PoseTrainConfig:
     """Placements in each step."""
     lr: Positive = 2e-3
     """Highest learning rate, before a cosine to 0."""
-    pixel_noise: CountOrNone = 4
-    """Largest change of a pixel by simulated camera noise, grey levels of 255."""

@@ -27,6 +27,7 @@ STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attrib
 """Config of pydantic dataclasses read from a file: no conversion, no unknown key."""
 
 RARE = "rarely needed"  # marks the annotation of an option that only `--help-all` shows
+FIXED = "not offered"  # marks that of a field that no command offers: a preset or Python sets it
 
 Number = TypeVar("Number", bound=float)
 

@@ -7,6 +7,7 @@ from pydantic import AfterValidator, Field
 
 from touchgoal.control import features as ft
 from touchgoal.runtime.option_types import (
+    FIXED,
     ORDERED,
     RARE,
     Count,
@@ -90,20 +91,18 @@ class SensorRandomization:
     0.39). The others: differences between published calibrations.
     """
 
-    gain: Annotated[NotNegative, Field(le=0.3)] = 0.047
-    """Standard deviation of each colour channel's gain."""
+    gain: Annotated[NotNegative, Field(le=0.3)] = (
+        0.047  # standard deviation of each colour channel's
+    )
+    # Standard deviations of a constant and of a smooth pattern added to the untouched image, of 255.
     offset: NotNegative = 2.4
-    """Standard deviation of a constant added to the untouched image, counts of 255."""
     pattern: NotNegative = 2.4
-    """Standard deviation of a smooth pattern added to the untouched image, counts of 255."""
-    azimuth: Annotated[NotNegative, Field(le=180)] = 15.0
-    """Largest rotation of each light around the gel, degrees."""
-    blur: Fraction = 0.3
-    """Largest relative change of the gel's smoothing of an imprint."""
-    pixel_pitch: bool = True
-    """Draw the millimetres per pixel from the sensor model's range."""
-    markers: Fraction = 0.1
-    """Largest shift of printed dots (share of their spacing) and relative change of their size."""
+    azimuth: Annotated[NotNegative, Field(le=180)] = 15.0  # largest turn of each light, degrees
+    blur: Fraction = 0.3  # largest relative change of the gel's smoothing of an imprint
+    pixel_pitch: bool = True  # draw the millimetres per pixel from the sensor model's range
+    markers: Fraction = (
+        0.1  # largest shift of dots, share of their spacing, and change of their size
+    )
 
 
 NO_RANDOMIZATION = SensorRandomization(
@@ -125,24 +124,15 @@ class SceneConfig:
     from `touchgoal calibrate`."""
     arm: Literal["fr3", "ur5e"] = "fr3"
     """Arm that carries the hand."""
-    meshes: Annotated[Literal["fast", "full"], RARE] = "fast"
+    meshes: Annotated[Literal["fast", "full"], FIXED] = "fast"
     """Meshes of the arm in camera images: collision meshes (fast: 2,500 triangles, 1 ms per frame in
     software OpenGL) or visual meshes true to 2 mm, with shadow and antialiasing (full: 72,000
     triangles, 40 ms)."""
-    timestep: Annotated[Positive, RARE] = 1e-3
-    """Time step of the physics, s; it must divide 2 ms."""
     front_camera: Annotated[CameraPlacement | None, RARE] = None
     """The front camera as calibrate-camera measured yours, in the base frame: x y z (m), quaternion wxyz (z
     looks ahead, y down), vertical field of view (degrees)."""
     wrist_camera: Annotated[CameraPlacement | None, RARE] = None
     """The same of the wrist camera, in the hand frame."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError if set-points would not fall on steps of the physics."""
-        if not _is_multiple(SETPOINT_PERIOD, self.timestep):
-            raise ValueError(
-                f"timestep must divide 2 ms (0.002, 0.001, 0.0005, ...), not {self.timestep:g}"
-            )
 
 
 def _one_or_three(changes: tuple[float, ...]) -> tuple[float, ...]:
@@ -175,12 +165,12 @@ class EnvConfig(SceneConfig):
     """Random hand motion added to each action, so that demonstrations show recoveries (DART, Laskey
     2017): RMS speed along each axis, m/s. The hand also turns, at 2 rad/s (in bead-maze 20 rad/s) per
     m/s; in fragile-carry the squeeze varies, too."""
-    randomization: Annotated[SensorRandomization, RARE] = SensorRandomization()
+    randomization: Annotated[SensorRandomization, FIXED] = SensorRandomization()
     """Differences between the two fingertip sensors, drawn for each episode."""
-    light_change: Annotated[LightChange, RARE] = (0.0,)
+    light_change: Annotated[LightChange, FIXED] = (0.0,)
     """Change of the fingertips' light after an episode's first image, as a share: one value, or
     red, green and blue. -0.15 dims them by 15 %."""
-    surroundings: Annotated[Surroundings, RARE] = USUAL
+    surroundings: Annotated[Surroundings, FIXED] = USUAL
     """Changes of the front camera and of the light in the room."""
     as_deployed: bool = False
     """Simulate the delays, limits and measurement errors of an arm driven by `deploy`."""
@@ -199,14 +189,11 @@ class EnvConfig(SceneConfig):
 
     def __post_init__(self) -> None:
         """Raise ValueError if a tick is no whole number of set-points, or an episode has none."""
-        super().__post_init__()
         if not _is_multiple(1 / self.control_hz, SETPOINT_PERIOD):
             raise ValueError(
                 f"control_hz is {self.control_hz}; it must divide 500 (10, 20, 25, 50, 100, ...), "
                 "because set-points come every 2 ms"
             )
-        if self.resolved_deployment() != IDEAL_DEPLOYMENT and not _is_multiple(1e-3, self.timestep):
-            raise ValueError(f"timestep is {self.timestep:g}; as deployed it must divide 1 ms")
         if self.max_seconds * self.control_hz < 1:
             raise ValueError(f"max_seconds must be at least a tick of 1/{self.control_hz} s")
 
@@ -224,13 +211,13 @@ class PickPlaceConfig(EnvConfig):
     """Range of the object's mass, kg."""
     grasp_force: ForceRange = (5.0, 30.0)
     """Range of the force of each finger, N."""
-    tolerance: Annotated[float, Field(gt=0, le=0.1, allow_inf_nan=False)] = 0.02
+    tolerance: Annotated[float, Field(gt=0, le=0.1, allow_inf_nan=False), FIXED] = 0.02
     """Largest distance of the placed object's centre from the goal, m."""
-    size_factor: Annotated[Positive, RARE] = 1.0
+    size_factor: Annotated[Positive, FIXED] = 1.0
     """Factor of the objects' sizes."""
-    friction_factor: Annotated[Positive, RARE] = 1.0
+    friction_factor: Annotated[Positive, FIXED] = 1.0
     """Factor of the objects' friction."""
-    nudge: Annotated[NotNegative, RARE] = 0.0
+    nudge: Annotated[NotNegative, FIXED] = 0.0
     """Distance by which the object is moved a second after the start, in a random direction, m."""
     release: bool = False
     """Success also requires that the hand lets go. The paper's reward curves end in touch, so by
@@ -279,7 +266,7 @@ class BeadMazeConfig(EnvConfig):
     """Wires to draw from, such as helix-1; default: the first `n-wires` of `split`."""
     split: Split = "training"
     """Set of wires to draw from; the sets are disjoint."""
-    families: tuple[Family, ...] = TRAINED
+    families: Annotated[tuple[Family, ...], FIXED] = TRAINED
     """Families of wires to draw from."""
     n_wires: Count | None = None
     """Number of wires to draw from; default: 200, or all if the split has fewer."""
@@ -289,9 +276,9 @@ class BeadMazeConfig(EnvConfig):
     """Range of the force of each finger, N."""
     start_angle: Annotated[NotNegative, Field(le=45)] = 0.0
     """Largest angle between hand and wire at the start, degrees."""
-    wire_friction: Annotated[tuple[Friction, Friction], ORDERED] = (0.15, 0.25)
+    wire_friction: Annotated[tuple[Friction, Friction], ORDERED, FIXED] = (0.15, 0.25)
     """Range of the friction coefficient between bead and wire."""
-    stall_seconds: Positive = 5.0
+    stall_seconds: Annotated[Positive, FIXED] = 5.0
     """Time without 2 mm of progress after which the bead counts as jammed, s."""
 
     def chosen_wires(self, count: int | None = None) -> list[Wire]:
@@ -326,14 +313,8 @@ class FragileCarryConfig(EnvConfig):
     from `touchgoal calibrate`."""
     cameras: tuple[Camera, ...] = ()
     """Observed cameras; fewer is faster."""
-    hold_force: ForceRange = (1.0, 8.0)
-    """Range of the force of each finger that just holds the rod, N, drawn log-uniformly."""
     mass: Annotated[tuple[Mass, Mass], ORDERED] = (0.1, 0.15)
     """Range of the rod's mass, kg; the friction follows from it and the force that holds."""
-    crush_ratio: Annotated[float, Field(gt=1)] = 2.5
-    """Force of a finger that crushes the rod, relative to the force that just holds it."""
-    tug: Fraction = 0.35
-    """Greatest force of the tug on the carried rod, relative to the rod's weight."""
 
 
 @checked_dataclass

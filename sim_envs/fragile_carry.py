@@ -34,6 +34,9 @@ _MAX_TILT = np.radians(12)
 _LEVEL_TILT, _LEVEL_HEIGHT, _STILL_SPEED = np.radians(3), 1.5e-3, 0.01  # rad, m, m/s
 _CRUSH_TICKS = 2  # successive control ticks above the crush force that break the rod
 _TUG_SECONDS = 0.3
+_HOLD_FORCE = 1.0, 8.0  # N of each finger that just holds the rod, drawn log-uniformly
+_CRUSH_RATIO = 2.5  # force of a finger that crushes the rod, relative to the one that just holds it
+_TUG = 0.35  # force of the tug on the carried rod, relative to its weight
 _TUG_ARM = 0.010  # m: farthest place of the tug from the rod's middle
 _SQUEEZE_DISTURBANCE = 60.0  # share of the force that holds, per m/s of disturbance
 
@@ -84,15 +87,15 @@ class FragileCarry(FrankaTactileEnv):
     def sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         """Draw the force that holds, the mass, and the tug; the friction follows."""
         config, chosen = self.config, with_options(FragileCarryReset(), options)
-        hold, mass = np.exp(rng.uniform(*np.log(config.hold_force))), rng.uniform(*config.mass)
+        hold, mass = np.exp(rng.uniform(*np.log(_HOLD_FORCE))), rng.uniform(*config.mass)
         self.hold_force = float(hold) if chosen.hold_force is None else chosen.hold_force
         mass = float(mass) if chosen.mass is None else chosen.mass
         weight = 9.81 * mass
-        self.crush_force = config.crush_ratio * self.hold_force
+        self.crush_force = _CRUSH_RATIO * self.hold_force
         self._friction = _TURN_FACTOR * weight / (2 * self.hold_force)
         self.grasp_force = GRIPPER_MAX_FORCE / 2  # the width target alone limits the force
         self.bodies = [Body(_ROD, (RADIUS, HALF_LENGTH), mass)]
-        pull = config.tug * weight
+        pull = _TUG * weight
         self._tug = np.array([0, 0, -pull, 0, pull * rng.uniform(-_TUG_ARM, _TUG_ARM), 0])  # N, Nm
         self._tug_place = rng.uniform(-0.03, 0.01)  # m, y, where the tug begins
 

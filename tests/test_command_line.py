@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from command_options import options_by_command
 
 from touchgoal import __version__
 from touchgoal.launch.__main__ import COMMANDS, main
@@ -64,11 +65,11 @@ def test_help_shows_the_first_options_and_help_all_shows_all(capsys: pytest.Capt
     with pytest.raises(SystemExit):
         options("--help")
     short = capsys.readouterr().out
-    assert "--env.timestep" not in short and "more options, rarely needed" in short
+    assert "--env.control-hz" not in short and "more options, rarely needed" in short
     assert short.count(" --") <= SHOWN + 10  # a switch is named twice, and texts name options
     with pytest.raises(SystemExit):
         options("--help-all")
-    assert "--env.timestep" in capsys.readouterr().out
+    assert "--env.control-hz" in capsys.readouterr().out
 
 
 def test_a_mistyped_option_or_command_is_guessed(capsys: pytest.CaptureFixture) -> None:
@@ -183,6 +184,18 @@ def test_every_option_is_described(name: str) -> None:
     for _, member in _members(module.Config):
         for (owner, field), _ in _all_options(member, None):
             assert docstrings(owner).get(field), f"{owner.__name__}.{field}"
+
+
+def test_every_option_is_set_by_a_test_a_page_or_a_recipe() -> None:
+    root = Path(__file__).parents[1]
+    patterns = ("Makefile", "*.md", "docs/*.md", "tests/**/*.py", "benchmarks/*.sh", "plugins/*.py")
+    text = "\n".join(path.read_text() for p in patterns for path in sorted(root.glob(p)))
+    typed = {o.replace(".no-", ".") for o in re.findall(r"--(?:no-)?([a-z][\w.-]*\w)", text)}
+    fields = set(re.findall(r"\b(\w+)=", text))  # of a Config made in Python
+    for command, options in options_by_command().items():
+        names = {option.removeprefix("--") for option in options if option.startswith("--")}
+        unset = {n for n in names - typed if n.split(".")[-1].replace("-", "_") not in fields}
+        assert not unset, f"{command}: nobody sets {unset}"
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBack
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.launch import demo
 from touchgoal.launch.__main__ import COMMANDS, usage
 from touchgoal.policies import checkpoint
 from touchgoal.sim_envs.config import PickPlaceConfig
@@ -82,7 +83,8 @@ def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    run("demo", "--out", tmp_path, "--env.max-seconds", 2.6)
+    config = demo.Config(out=tmp_path)
+    demo.main(replace(config, env=replace(config.env, max_seconds=2.6)))
     for name in ("episode.mp4", "curves.png", "curves.csv", "metrics.json", "config.json"):
         assert (tmp_path / name).stat().st_size > 0
     frames, fps = read_frames(tmp_path / "episode.mp4")

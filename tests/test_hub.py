@@ -77,7 +77,7 @@ def test_a_policy_keeps_its_parts_and_a_later_push_its_own(hub: HubServer, tmp_p
     shutil.copytree(POLICY, run / "policy")
     (run / "policy" / "README.md").write_text("my own card")
     (run / "policy" / "notes.txt").write_text("not data")
-    push(run, "lab/picker", True, api(hub))
+    push(run, "lab/picker", private=True, api=api(hub))
     assert hub.private == {"lab/picker"}
     assert hub.repositories["lab/picker"]["README.md"] == b"my own card"
     with pulled("lab/picker", tmp_path, api(hub)) as (folder, kind):
@@ -85,7 +85,7 @@ def test_a_policy_keeps_its_parts_and_a_later_push_its_own(hub: HubServer, tmp_p
         assert kind == "policy" and find_policy(folder) == folder
         assert files(folder) == {**files(POLICY), "README.md": b"my own card"}
     (run / "policy" / "recipe.json").unlink()
-    push(run, "lab/picker", True, api(hub))
+    push(run, "lab/picker", private=True, api=api(hub))
     assert "recipe.json" not in hub.repositories["lab/picker"]
     assert ".gitattributes" in hub.repositories["lab/picker"]  # none of our files
 

@@ -11,13 +11,13 @@ import torch
 from in_process import in_process_workers, run_benchmark
 
 from benchmarks.papers.mmwand.real import zero_shot
+from benchmarks.papers.mmwand.splits import SPLITS, split_touches
 from benchmarks.published_touch.objectfolder_real import (
     read_objectfolder_real,
     read_touches,
 )
 from benchmarks.published_touch.tvl import read_tvl
 from touchgoal.control import features as ft
-from touchgoal.encoders.alignment.splits import SPLITS, split_touches
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers

@@ -66,7 +66,7 @@ def test_the_benchmark_judges_encoders(clips: Path) -> None:
 
 def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
     """Adapting shrinks distances between videos of one object relative to other objects."""
-    main(["train-encoder", "adapt", "--data", str(clips), "--share", "0.9", "--out", str(tmp_path)])
+    main(["train-encoder", "adapt", "--data", str(clips), "--out", str(tmp_path)])
     adapted = load_encoder(tmp_path / "encoder")
     goals = adapted.embed_text_goal(["a soft object", "a slightly hard object"], OfflineTowers())
     touches = [adapted.embed(press(obj))[5:].mean(0) for obj in (0, 1)]

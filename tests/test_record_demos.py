@@ -132,7 +132,7 @@ class Pushed(TeleoperationDevice):
 
 def act(twist: list[float], wrench: tuple[float, ...] = (0.0,) * 6) -> tuple[np.ndarray, ...]:
     """What an action moves (m) and turns (rad, base frame), and the gripper's width."""
-    config = TeleoperationConfig(speed=0.1, turn_speed=0.4, compliance=2e-3)
+    config = TeleoperationConfig(speed=0.1, turn_speed=0.4)
     kinematics = Kinematics(FR3.arm, FR3.tool.tcp_offset)
     q = FR3.arm.home
     hand = Teleoperator(Pushed(twist), ActionFilter(FR3, HZ), lambda: q, config)

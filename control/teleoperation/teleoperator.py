@@ -15,7 +15,7 @@ from touchgoal.control.motion.compliance import Compliance
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.control.teleoperation.config import TeleoperationConfig
+from touchgoal.control.teleoperation.config import COMPLIANCE, TeleoperationConfig
 from touchgoal.control.teleoperation.device import TeleoperationDevice
 
 # Nm. The drift of an arm's own estimate passes it and turns the hand a little, which is corrected: of
@@ -37,8 +37,7 @@ class Teleoperator(Actor):
         self._device, self._commanded, self._config = device, commanded, config
         self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
         self._widths = {"close": safety.limits.tool.stroke[0], "open": safety.limits.tool.stroke[1]}
-        yields = config.compliance, config.rotational_compliance
-        self._compliance = Compliance(*yields, _FREE_TORQUE)
+        self._compliance = Compliance(*COMPLIANCE, _FREE_TORQUE)
         self._dt = safety.dt
 
     def start(self, observation: Observation) -> None:

@@ -10,7 +10,7 @@ from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.compliance import Compliance
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.control.teleoperation.config import TeleoperationConfig
+from touchgoal.control.teleoperation.config import COMPLIANCE
 
 _MORE = 2  # times as much as a led hand: a policy sees where to stop less well than the person who led it
 
@@ -28,11 +28,10 @@ class YieldingActor(Actor):
         self, actor: Actor, safety: ActionFilter, commanded: Callable[[], np.ndarray]
     ) -> None:
         """Take an actor; `commanded` returns the joints (rad) commanded now."""
-        hand = TeleoperationConfig()
         self._actor, self._commanded, self._dt = actor, commanded, safety.dt
         self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
-        more = _MORE * hand.compliance, _MORE * hand.rotational_compliance
-        self._compliance = Compliance(*more, _FREE_TORQUE)
+        linear, angular = COMPLIANCE
+        self._compliance = Compliance(_MORE * linear, _MORE * angular, _FREE_TORQUE)
 
     def start(self, observation: Observation) -> None:
         """See Actor; the first wrench is that of the free hand."""

@@ -14,6 +14,10 @@ from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.infonce import symmetric_info_nce
 from touchgoal.encoders.backbones.tower_map import TowerMap
 
+_BATCH, _LR, _WEIGHT_DECAY = 256, 2e-3, 0.02  # touches a step; of AdamW, with a cosine to 0
+_TEMPERATURE = 0.07  # of the InfoNCE losses
+_TEXT_HIDDEN = 512  # width of the hidden layer beside the linear map of sentences
+
 
 @dataclass(frozen=True, eq=False)
 class PairedEmbeddings:
@@ -44,15 +48,15 @@ def fit_heads(data: PairedEmbeddings, config: HeadsConfig, seed: int) -> Heads:
     dims = data.touch.shape[1], data.image.shape[2], data.texts.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        heads = Heads(*dims, config.text_hidden)
+        heads = Heads(*dims, _TEXT_HIDDEN)
     heads.image.centre(data.image)
     heads.text.centre(data.texts)
-    optimizer = torch.optim.AdamW(heads.parameters(), config.lr, weight_decay=config.weight_decay)
+    optimizer = torch.optim.AdamW(heads.parameters(), _LR, weight_decay=_WEIGHT_DECAY)
     n = len(data.touch)
-    steps = max(n // config.batch_size, 1) * config.epochs
+    steps = max(n // _BATCH, 1) * config.epochs
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
-        rows = torch.randperm(n, generator=draw)[: config.batch_size]
+        rows = torch.randperm(n, generator=draw)[:_BATCH]
         optimizer.zero_grad()
         _loss(heads, data, rows, config, draw).backward()
         optimizer.step()
@@ -68,16 +72,17 @@ def _loss(
     draw: torch.Generator,
 ) -> Float[Tensor, ""]:
     """Return the loss of a batch; touches without views take part in touch and text alone."""
-    sentence, label, tau = _draw_sentences(data, rows, draw), data.label[rows], config.temperature
+    sentence, label = _draw_sentences(data, rows, draw), data.label[rows]
     touch, text = data.touch[rows], heads.text(data.texts[sentence])
     same = (label[:, None] == label) | (sentence[:, None] == sentence)
     viewed = rows < len(data.image)
     view = torch.randint(data.image.shape[1], (int(viewed.sum()),), generator=draw)
     image, both = heads.image(data.image[rows[viewed], view]), same[viewed][:, viewed]
-    loss = symmetric_info_nce(touch[viewed], image, tau, both)
-    loss = loss + symmetric_info_nce(image, text[viewed], tau, both)
+    loss = symmetric_info_nce(touch[viewed], image, _TEMPERATURE, both)
+    loss = loss + symmetric_info_nce(image, text[viewed], _TEMPERATURE, both)
     if config.text_weight:
-        loss = loss + config.text_weight * symmetric_info_nce(touch, text, tau, same)
+        own = symmetric_info_nce(touch, text, _TEMPERATURE, same)
+        loss = loss + config.text_weight * own
     return loss
 
 

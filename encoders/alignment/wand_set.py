@@ -16,6 +16,8 @@ from touchgoal.episodes.touches import Touches
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
+_TEST_SHARE = 1048 / 5182  # MMWand's share of test touches
+
 
 def is_wand_set(root: Path, keys: Mapping[str, str] | None = None) -> bool:
     """Whether a folder holds touches of the wand; UserError if it holds no set.
@@ -62,6 +64,12 @@ class WandSet:
 
     def __len__(self) -> int:
         return len(self.label)
+
+    def hold_out_visits(self, seed: int) -> tuple[Int[np.ndarray, " a"], Int[np.ndarray, " b"]]:
+        """Return rows to train on, and those of a fifth of the visits to test on."""
+        rng = np.random.default_rng([seed, 11])
+        test = np.isin(self.visit, draw_held_out(rng, np.unique(self.visit)))
+        return np.flatnonzero(~test), np.flatnonzero(test)
 
     def pictures(self, i: int) -> tuple[Picture, Picture]:
         """Return the untouched and the firmest picture of a touch, RGB."""
@@ -114,3 +122,8 @@ class WandSet:
             for i in track(range(len(self)), "embedding views", "touch")
         ]
         return torch.stack(rows).numpy()
+
+
+def draw_held_out(rng: np.random.Generator, items: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+    """Draw MMWand's share of the items to test on."""
+    return rng.permutation(items)[: round(_TEST_SHARE * len(items))]

@@ -27,6 +27,9 @@ from touchgoal.runtime.progress import track
 ANNOTATIONS, LEFT_OUT = "annotations.jsonl", "left_out.jsonl"
 _SENSOR_SOUGHT = 5  # first frames in which the sensor is looked for: the reference may not show it
 
+_MIN_DEFORMATION = 1.5  # least that counts as contact, times the untouched frames' noise
+_CAPTION_PROMPT = "What specific object is presented in the scene?"  # MMWand, appendix A
+
 
 def annotate_all(
     recordings: Sequence[VisGelRecording],
@@ -77,7 +80,7 @@ def annotate(
     """
     touches = (_read(root / touch) for _, touch in recording.steps)
     reference_touch = root / recording.reference[1]
-    contact = match_contact(touches, _read(reference_touch), settings.min_deformation)
+    contact = match_contact(touches, _read(reference_touch), _MIN_DEFORMATION)
     contact_image, touch = recording.steps[contact.index]
     video = _video_until(recording, contact_image)
     sensor = _track_sensor([root / name for name in video], models, settings)
@@ -85,12 +88,11 @@ def annotate(
     at_contact = sensor[-1]
     assert at_contact is not None  # match_reference has checked it
     image = _read(root / video[chosen])
-    detections = models.detect(image, settings.object_prompt)
+    detections = models.detect(image, "object")
     kept, dropped = select_instances(detections, sensor[chosen], settings.min_score)
     touched, overlap = match_instance(kept, at_contact, settings.min_overlap)
     instances = tuple(
-        Instance(d.box, d.score, models.caption(crop(image, d.box), settings.caption_prompt))
-        for d in kept
+        Instance(d.box, d.score, models.caption(crop(image, d.box), _CAPTION_PROMPT)) for d in kept
     )
     if not instances[touched].caption:
         raise LeftOut("empty caption of the touched object")
@@ -132,7 +134,7 @@ def _track_sensor(
 def _find_sensor(
     image: Image, models: AnnotationModels, settings: AnnotationSettings
 ) -> Box | None:
-    found = models.detect(image, settings.sensor_prompt)
+    found = models.detect(image, "robot gripper")
     best = max(found, key=lambda d: d.score, default=None)
     return best.box if best is not None and best.score >= settings.min_score else None
 

@@ -8,24 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from touchgoal.runtime.option_types import (
-    ORDERED,
-    RARE,
-    Count,
-    Fraction,
-    NotNegative,
-    Positive,
-    checked_dataclass,
-)
-
-Scale = Annotated[float, Field(gt=0, le=1)]  # share of the patches of an image
-Scales = Annotated[tuple[Scale, Scale], ORDERED]
-"""Least and greatest share of the patches in a block, drawn for each batch."""
-
-
-def _check_heads(network: str, width: int, heads: int) -> None:
-    if width % heads:
-        raise ValueError(f"{network}_width {width} must be a multiple of {network}_heads {heads}")
+from touchgoal.runtime.option_types import FIXED, Count, Fraction, Positive, checked_dataclass
 
 
 @checked_dataclass
@@ -39,11 +22,12 @@ class _UnlabelledConfig:
     batch_size: Count = 64
     """Touches in each step; all of them if there are fewer."""
     lr: Positive = 1e-3
-    """Highest learning rate of AdamW; it rises from 0 during `warmup`, then falls by a cosine."""
-    warmup: Annotated[Fraction, RARE] = 0.1
-    """Share of the steps in which the learning rate rises from 0."""
-    weight_decay: NotNegative = 0.04
-    """Weight decay of weight matrices and convolutions at the start."""
+    """Highest learning rate of AdamW; it rises from 0, then falls by a cosine."""
+    warmup: Annotated[float, FIXED] = 0.1  # share of the steps in which the learning rate rises
+    weight_decay: Annotated[float, FIXED] = (
+        0.04  # of weight matrices and convolutions, at the start
+    )
+    final_weight_decay: Annotated[float, FIXED] = 0.4  # reached by a cosine
 
 
 @checked_dataclass
@@ -51,9 +35,8 @@ class MaeConfig(_UnlabelledConfig):
     """Hyperparameters of masked autoencoding (MAE)."""
 
     batch_size: Count = 128
-    weight_decay: NotNegative = 0.05
-    final_weight_decay: Annotated[NotNegative | None, RARE] = None
-    """Weight decay at the end, reached by a cosine; default: as at the start."""
+    weight_decay: Annotated[float, FIXED] = 0.05
+    final_weight_decay: Annotated[float, FIXED] = 0.05
     stacked: bool = False
     """Stack an earlier frame as further input channels, as Sparsh does; `base` needs it."""
     mask_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.5
@@ -61,19 +44,14 @@ class MaeConfig(_UnlabelledConfig):
     bottleneck: bool = True
     """Decode from the mean of the backbone's tokens alone, so that this mean, which is the embedding,
     must describe the whole image. Otherwise the decoder reads all tokens, as published."""
-    decoder_width: Annotated[Count, RARE] = 96
-    """Width of the decoder's tokens."""
-    decoder_depth: Annotated[Count, RARE] = 2
-    """Number of the decoder's blocks."""
-    decoder_heads: Annotated[Count, RARE] = 4
-    """Attention heads of each decoder block; they divide the decoder's width."""
-    second_moment: Annotated[Fraction, RARE] = 0.999
-    """AdamW's beta 2: decay of its running mean of squared gradients."""
+    decoder_width: Annotated[int, FIXED] = 96  # of the decoder's tokens
+    decoder_depth: Annotated[int, FIXED] = 2  # blocks
+    decoder_heads: Annotated[int, FIXED] = 4  # of each block; they divide the width
+    second_moment: Annotated[float, FIXED] = 0.999  # AdamW's beta 2
 
     def __post_init__(self) -> None:
         if self.vit == "base" and not self.stacked:
             raise ValueError("base is Sparsh's, which stacks two frames: it needs stacked")
-        _check_heads("decoder", self.decoder_width, self.decoder_heads)
 
 
 MAE_PRESETS: dict[str, MaeConfig] = {
@@ -101,48 +79,27 @@ MAE_PRESETS: dict[str, MaeConfig] = {
 class SelfDistillationConfig(_UnlabelledConfig):
     """Hyperparameters that DINO, I-JEPA and V-JEPA share: the teacher and schedules."""
 
-    final_lr: Annotated[Fraction, RARE] = 1e-3
-    """Learning rate at the end as a share of `lr`."""
-    final_weight_decay: NotNegative = 0.4
-    """Weight decay at the end, reached by a cosine."""
     momentum: Fraction = 0.99
     """Momentum of the teacher, the moving average of the student's weights, at the start."""
-    final_momentum: Fraction = 1.0
-    """Momentum of the teacher at the end, reached linearly."""
+    final_momentum: Annotated[float, FIXED] = 1.0  # of the teacher, reached linearly
+    final_lr: Annotated[float, FIXED] = 1e-3  # share of `lr`
 
 
 @checked_dataclass
 class DinoConfig(SelfDistillationConfig):
     """Hyperparameters of self-distillation without labels (DINO)."""
 
-    reads: Literal["register", "mean"] = "mean"
-    """Input of the DINO head: a register token, as in Sparsh, or the mean of the patch tokens, which is
-    the embedding that is used afterwards."""
-    prototypes: Count = 1024
-    """Number of prototypes, the classes that the teacher makes up."""
-    head_width: Annotated[Count, RARE] = 256
-    """Width of the head's two hidden layers."""
-    head_bottleneck: Annotated[Count, RARE] = 64
-    """Width of the vectors that are compared with the prototypes."""
-    batch_norm: bool = True
-    """Use batch norm in the head's hidden layers. Without it the small presets collapse: an untrained
-    backbone gives most touches nearly the same tokens."""
-    student_temperature: Positive = 0.1
-    """Temperature of the student's distribution over prototypes."""
-    teacher_temperature: Positive = 0.07
-    """Temperature of the teacher's distribution, which is sharper."""
-    first_teacher_temperature: Annotated[Positive, RARE] = 0.04
-    """Teacher's temperature at the start; it rises linearly."""
-    teacher_warmup: Annotated[Fraction, RARE] = 0.07
-    """Share of the steps in which the teacher's temperature rises."""
-    center_momentum: Annotated[Fraction, RARE] = 0.9
-    """Momentum of the teacher's mean output, which is subtracted against collapse."""
-    global_scale: Scales = (0.48, 1.0)
-    """Size of the two large views, the teacher's input, as a share of the patches."""
-    local_scale: Scales = (0.1, 0.48)
-    """Size of the small views, which only the student gets, as a share of the patches."""
     local_views: Count = 8
     """Small views of each touch."""
+    # Input of the head: a register token, as in Sparsh, or the mean of the patch tokens, which is
+    # the embedding that is used afterwards.
+    reads: Annotated[Literal["register", "mean"], FIXED] = "mean"
+    prototypes: Annotated[int, FIXED] = 1024  # the classes that the teacher makes up
+    head_width: Annotated[int, FIXED] = 256  # of the head's two hidden layers
+    head_bottleneck: Annotated[int, FIXED] = 64  # width of the vectors compared with prototypes
+    # Batch norm in the head's hidden layers. Without it the small preset collapses: an untrained
+    # backbone gives most touches nearly the same tokens.
+    batch_norm: Annotated[bool, FIXED] = True
 
 
 DINO_PRESETS: dict[str, DinoConfig] = {
@@ -167,49 +124,23 @@ DINO_PRESETS: dict[str, DinoConfig] = {
 
 @checked_dataclass
 class PredictorConfig(SelfDistillationConfig):
-    """Hyperparameters of the predictor in I-JEPA and V-JEPA."""
+    """Hyperparameters of I-JEPA and V-JEPA: their predictor of hidden tokens."""
 
-    predictor_width: Annotated[int, Field(ge=12, multiple_of=12)] = 96
-    """Width of the predictor's tokens."""
-    predictor_depth: Annotated[Count, RARE] = 3
-    """Number of the predictor's blocks."""
-    predictor_heads: Annotated[Count, RARE] = 4
-    """Attention heads of each predictor block; they divide its width."""
-    shortest: Annotated[Positive, RARE] = 0.75
-    """Least height over width of a target block."""
-    tallest: Annotated[Positive, RARE] = 1.5
-    """Greatest height over width of a target block."""
-
-    def __post_init__(self) -> None:
-        _check_heads("predictor", self.predictor_width, self.predictor_heads)
-        if self.shortest > self.tallest:
-            raise ValueError("shortest must not be above tallest")
+    predictor_width: Annotated[int, FIXED] = 96  # of its tokens, a multiple of 12
+    predictor_depth: Annotated[int, FIXED] = 3  # blocks
+    predictor_heads: Annotated[int, FIXED] = 4  # of each block; they divide the width
 
 
 @checked_dataclass
 class IJepaConfig(PredictorConfig):
     """Hyperparameters of I-JEPA: predict the tokens of hidden blocks."""
 
-    context_scale: Scales = (0.85, 1.0)
-    """Size of the context block, from which the target blocks are cut out, as a share of the patches."""
-    target_scale: Scales = (0.15, 0.2)
-    """Size of each target block, as a share of the patches."""
-    target_blocks: Count = 4
-    """Target blocks of each image."""
-
 
 @checked_dataclass
 class VJepaConfig(PredictorConfig):
     """Hyperparameters of V-JEPA: predict the tokens of tubes hidden in a clip."""
 
-    small_scale: Annotated[Scale, RARE] = 0.15
-    """Size of each hidden block of the first mask, as a share of the patches."""
-    small_blocks: Count = 8
-    """Hidden blocks of the first mask."""
-    large_scale: Annotated[Scale, RARE] = 0.7
-    """Size of each hidden block of the second mask, as a share of the patches."""
-    large_blocks: Count = 2
-    """Hidden blocks of the second mask."""
+    small_blocks: Annotated[int, FIXED] = 8  # hidden blocks of the first mask
 
 
 _JEPA_PAPER: dict[str, Any] = {

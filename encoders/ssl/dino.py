@@ -19,6 +19,11 @@ from touchgoal.encoders.ssl.self_distillation import SelfDistillation, frozen_co
 from touchgoal.encoders.training.trainer import gather_batch, own_rows
 
 _GLOBAL_VIEWS = 2
+_GLOBAL_SCALE, _LOCAL_SCALE = (0.48, 1.0), (0.1, 0.48)  # share of the patches in a view
+_STUDENT_TEMPERATURE = 0.1
+# The teacher's, which is sharper, rises linearly in the first share of the steps.
+_FIRST_TEMPERATURE, _TEACHER_TEMPERATURE, _TEMPERATURE_WARMUP = 0.04, 0.07, 0.07
+_CENTER_MOMENTUM = 0.9  # of the teacher's mean output, which is subtracted against collapse
 
 
 class DinoHead(nn.Module):
@@ -71,8 +76,8 @@ class Dino(SelfDistillation):
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
         """Draw blocks of the image's shape: `global_ids` (count, 2, k), `local_ids` (count, v, j)."""
         grid, config = patch_grid(self.backbone.config.vit), self.config
-        views = {"global_ids": (config.global_scale, _GLOBAL_VIEWS)}
-        views["local_ids"] = (config.local_scale, config.local_views)
+        views = {"global_ids": (_GLOBAL_SCALE, _GLOBAL_VIEWS)}
+        views["local_ids"] = (_LOCAL_SCALE, config.local_views)
         drawn = {}
         for name, ((low, high), blocks) in views.items():
             side = math.sqrt(low + (high - low) * torch.rand((), generator=generator).item())
@@ -91,7 +96,7 @@ class Dino(SelfDistillation):
         views = [global_ids, local_ids]
         student = self._scores(self.backbone, self.head, images, views)
         with torch.autocast(images.device.type, enabled=False):
-            loss = cross_entropy_of_views(targets, student / self.config.student_temperature)
+            loss = cross_entropy_of_views(targets, student / _STUDENT_TEMPERATURE)
         if self.training:
             self._move_center(scores)
         every = gather_batch(targets.transpose(0, 1)).transpose(0, 1)
@@ -117,16 +122,15 @@ class Dino(SelfDistillation):
 
     def _targets(self, scores: Float[Tensor, "2 b p"]) -> Float[Tensor, "2 b p"]:
         """Return the teacher's distributions over prototypes."""
-        config = self.config
-        warm = min(self.done / config.teacher_warmup, 1.0) if config.teacher_warmup else 1.0
-        first = config.first_teacher_temperature
-        temperature = first + warm * (config.teacher_temperature - first)
+        warm = min(self.done / _TEMPERATURE_WARMUP, 1.0)
+        rise = _TEACHER_TEMPERATURE - _FIRST_TEMPERATURE
+        temperature = _FIRST_TEMPERATURE + warm * rise
         return ((scores - self.center) / temperature).softmax(2)
 
     @torch.no_grad()
     def _move_center(self, scores: Float[Tensor, "2 b p"]) -> None:
         mean = gather_batch(scores.flatten(0, 1)).mean(0)
-        self.center.lerp_(mean, 1 - self.config.center_momentum)
+        self.center.lerp_(mean, 1 - _CENTER_MOMENTUM)
 
 
 def cross_entropy_of_views(

@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from touchgoal.encoders.backbones.vit import patch_grid
-from touchgoal.encoders.ssl.config import IJepaConfig
 from touchgoal.encoders.ssl.masks import (
     draw_blocks,
     draw_equal_counts,
@@ -16,28 +15,29 @@ from touchgoal.encoders.ssl.masks import (
     draw_targets,
     union_of_blocks,
 )
-from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, gather_tokens
+from touchgoal.encoders.ssl.predictor import ASPECT, JointEmbeddingPrediction, gather_tokens
 
 _SQUARE = 1.0, 1.0
+# Share of the patches in the context block, from which the target blocks are cut out, and in each
+# target block, as in Assran et al.
+_CONTEXT_SCALE, _TARGET_SCALE = (0.85, 1.0), (0.15, 0.2)
+_TARGET_BLOCKS = 4  # of each image
 
 
 class IJepa(JointEmbeddingPrediction):
     """I-JEPA objective: predict each target block from a large block without the target blocks."""
-
-    config: IJepaConfig
 
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
         """Draw `context_ids` (count, k) and `target_ids` (count, blocks, j).
 
         k is that of the image with the fewest; of other images some are dropped.
         """
-        config, grid = self.config, patch_grid(self.backbone.config.vit)
-        size = draw_size(grid, config.context_scale, _SQUARE, generator)
+        grid = patch_grid(self.backbone.config.vit)
+        size = draw_size(grid, _CONTEXT_SCALE, _SQUARE, generator)
         context = union_of_blocks(draw_blocks(grid, size, count, 1, generator), grid[0] * grid[1])
-        aspect = config.shortest, config.tallest
-        size = draw_size(grid, config.target_scale, aspect, generator)
+        size = draw_size(grid, _TARGET_SCALE, ASPECT, generator)
         target, left = draw_targets(
-            grid, size, count, config.target_blocks, context, self.min_context, generator
+            grid, size, count, _TARGET_BLOCKS, context, self.min_context, generator
         )
         return {"context_ids": draw_equal_counts(left, generator), "target_ids": target}
 

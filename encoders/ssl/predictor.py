@@ -10,6 +10,8 @@ from touchgoal.encoders.backbones.vit import Block, ViTConfig, patch_grid, sinus
 from touchgoal.encoders.ssl.config import PredictorConfig
 from touchgoal.encoders.ssl.self_distillation import SelfDistillation
 
+ASPECT = 0.75, 1.5  # least and greatest height over width of a target block, as in Assran et al.
+
 
 class Predictor(nn.Module):
     """Narrow transformer from the tokens of given patches to those of others."""

@@ -10,7 +10,10 @@ from torch import Tensor
 from touchgoal.encoders.backbones.vit import patch_grid
 from touchgoal.encoders.ssl.config import VJepaConfig
 from touchgoal.encoders.ssl.masks import draw_equal_counts, draw_size, draw_targets, union_of_blocks
-from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, gather_tokens
+from touchgoal.encoders.ssl.predictor import ASPECT, JointEmbeddingPrediction, gather_tokens
+
+_SMALL_SCALE, _LARGE_SCALE = 0.15, 0.7  # share of the patches in a hidden block of each mask
+_LARGE_BLOCKS = 2  # hidden blocks of the second mask
 
 
 class VJepa(JointEmbeddingPrediction):
@@ -30,12 +33,9 @@ class VJepa(JointEmbeddingPrediction):
         grid, times = patch_grid(vit), vit.frames // vit.tubelet
         everything = torch.ones(count, grid[0] * grid[1], dtype=torch.bool)
         drawn: dict[str, list[Tensor]] = {"context_ids": [], "target_ids": []}
-        for scale, blocks in (
-            (config.small_scale, config.small_blocks),
-            (config.large_scale, config.large_blocks),
-        ):
-            aspect = config.shortest, config.tallest
-            size = draw_size(grid, (scale, scale), aspect, generator)
+        masks = (_SMALL_SCALE, config.small_blocks), (_LARGE_SCALE, _LARGE_BLOCKS)
+        for scale, blocks in masks:
+            size = draw_size(grid, (scale, scale), ASPECT, generator)
             hidden, left = draw_targets(grid, size, count, blocks, everything, 1, generator)
             target = draw_equal_counts(union_of_blocks(hidden, everything.shape[1]), generator)
             context = draw_equal_counts(left, generator)

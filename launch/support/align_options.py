@@ -2,11 +2,11 @@
 
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
-from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig, Split
+from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig
 from touchgoal.encoders.training.options import SetTrainerOptions
-from touchgoal.runtime.option_types import RARE, Count, CountOrNone, checked_dataclass
+from touchgoal.runtime.option_types import Count, checked_dataclass
 
 Preset = Literal["default", "paper"]
 
@@ -27,10 +27,8 @@ class Align(SetTrainerOptions):
     --sensor."""
     validation: Path | None = None
     """Other episodes (or another annotations.jsonl), at least four of each object. Retrieval on one half
-    of them chooses the best epoch; the other half is the test set. Of touches of the wand a fifth is
-    held out instead."""
-    split: Annotated[Split, RARE] = "press"
-    """Units held out of touches of the wand: single touches, visits, objects or sentences."""
+    of them chooses the best epoch; the other half is the test set. Of touches of the wand a fifth of
+    the visits is held out instead."""
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""
     preset: Preset = "default"
@@ -40,10 +38,6 @@ class Align(SetTrainerOptions):
     """Fingertip sensor of episodes that do not name theirs."""
     towers: str = "offline"
     """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local folder."""
-    contact_frames: Count = 24
-    """Frames with contact taken from each episode."""
-    no_contact_frames: CountOrNone = 8
-    """Frames without contact taken from each episode."""
     normalizer_episodes: Count = 40
     """Successful training episodes on which the normalizer is fitted (encoder/normalizer.json): it
     scales distances in reward curves to 1 at the usual start of an episode and 0 at its goal."""

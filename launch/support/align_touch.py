@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from touchgoal.encoders.alignment.align import align
-from touchgoal.encoders.alignment.splits import split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet, is_wand_set
 from touchgoal.encoders.annotation.touches import open_annotations
 from touchgoal.encoders.ssl.frames import find_sensor_name
@@ -19,6 +18,8 @@ from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 from touchgoal.runtime.provenance import provenance
+
+_CONTACT_FRAMES, _NO_CONTACT_FRAMES = 24, 8  # taken from each episode
 
 
 def align_touch(config: Align) -> None:
@@ -43,7 +44,7 @@ def align_touch(config: Align) -> None:
         )
     towers = load_towers(config.towers)
     out = open_training(config, "train-encoder")
-    drawn = config.contact_frames, config.no_contact_frames, config.seed
+    drawn = _CONTACT_FRAMES, _NO_CONTACT_FRAMES, config.seed
     train, val = (collect_touches(episodes, *drawn) for episodes in (data, validation))
     print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
     made_from = recipe(data, validation)
@@ -67,11 +68,11 @@ def _align_wand(config: Align) -> None:
         raise UserError(f"{config.data} holds touches of the wand: leave --validation out")
     data = WandSet.open(config.data)
     sensor, towers = find_sensor_name(config.sensor, data.episodes), load_towers(config.towers)
-    fold = split_touches(config.split, data.label, data.visit, data.describes, config.seed)
+    rows, held_out = data.hold_out_visits(config.seed)
     out = open_training(config, "train-encoder")
-    print(f"{len(fold.train)} touches of {len(data.names)} objects; {len(fold.test)} held out")
+    print(f"{len(rows)} touches of {len(data.names)} objects; {len(held_out)} held out")
     source = {"data": str(config.data), "checksum": data.episodes.checksum, **provenance()}
-    train, test = data.touches(fold.train), data.touches(fold.test)
+    train, test = data.touches(rows), data.touches(held_out)
     align(train, test, towers, config.align, sensor, out, config, source)
     print(f"encoder: {out / 'encoder'}")
 

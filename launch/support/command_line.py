@@ -19,7 +19,7 @@ from tyro.constructors import (
 )
 
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.option_types import RARE, OptionError
+from touchgoal.runtime.option_types import FIXED, RARE, OptionError
 from touchgoal.sim_envs.config import EnvConfig
 
 SHOWN = 20  # options that --help shows; --help-all shows all of them
@@ -102,7 +102,13 @@ def _as_options(
         if hint is not None:
             offered = Annotated[offered, tyro.conf.arg(help_behavior_hint=hint)]
         fields.append(StructFieldSpec(field.name, offered, default, text))
-    return StructConstructorSpec(partial(_make, info.type), tuple(fields))
+    offered_names = {field.name for field in fields}
+    kept = {  # of a preset
+        f.name: _default(f, info.default)
+        for f in dataclasses.fields(info.type)
+        if f.name not in offered_names
+    }
+    return StructConstructorSpec(partial(_make, info.type, **kept), tuple(fields))
 
 
 def _make(config_type: type, **values: Any) -> Any:
@@ -123,11 +129,12 @@ def _default(field: dataclasses.Field, parent: Any) -> Any:
 
 
 def _options(config_type: type) -> list[tuple[dataclasses.Field, Any, str]]:
-    """Return the fields of a dataclass with annotations and help texts, ranges included."""
+    """Return the fields of a dataclass that are options, annotated, with help texts and ranges."""
     hints, texts = get_type_hints(config_type, include_extras=True), docstrings(config_type)
     return [
         (f, hints[f.name], _with_range(texts.get(f.name, ""), hints[f.name]))
         for f in dataclasses.fields(config_type)
+        if FIXED not in getattr(hints[f.name], "__metadata__", ())
     ]
 
 

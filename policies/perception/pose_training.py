@@ -23,6 +23,7 @@ _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose count
 _FINDER_ROWS = 4  # the first look, which learns faster, is trained on one of so many samples
 _WORD_NOISE = 0.015  # standard deviation of each number of a sentence's embedding of length 1
 _PLACE_NOISE = 8.0  # px by which crops are off in training: a cell of the first look
+_PIXEL_NOISE = 4  # largest change of a pixel by simulated camera noise, grey levels
 _BATCH = 64
 _BAD, _FALSE_REFUSALS = (0.02, 20.0), 0.02  # m and degrees by which an estimate is off; share
 
@@ -49,9 +50,7 @@ def train_pose_estimator(
         return {
             "pictures": evenly_lit(
                 {
-                    key: _add_pixel_noise(
-                        placements.pictures[key][rows], box, config.pixel_noise, noise
-                    )
+                    key: _add_pixel_noise(placements.pictures[key][rows], box, noise)
                     for key, box in estimator.config.crops
                 }
             ),
@@ -151,7 +150,7 @@ def _places(
 
 
 def _add_pixel_noise(
-    pictures: UInt8[Tensor, "b h w 3"], box: Box, counts: int, noise: BatchNoise
+    pictures: UInt8[Tensor, "b h w 3"], box: Box, noise: BatchNoise
 ) -> UInt8[Tensor, "b h w 3"]:
     """Change the images in the box, and return them."""
     top, bottom, left, right = box
@@ -159,7 +158,7 @@ def _add_pixel_noise(
     added = noise.draw(
         len(crop),
         lambda n, g: torch.randint(
-            -counts, counts + 1, (n, *crop.shape[1:]), dtype=torch.int16, generator=g
+            -_PIXEL_NOISE, _PIXEL_NOISE + 1, (n, *crop.shape[1:]), dtype=torch.int16, generator=g
         ),
     )
     crop.copy_((crop + added).clamp(0, 255))

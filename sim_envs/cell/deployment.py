@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from touchgoal.runtime.option_types import ORDERED, checked_dataclass
+from touchgoal.runtime.option_types import FIXED, ORDERED, checked_dataclass
 
 Delay = Annotated[float, Field(ge=0.0, le=0.2)]
 """s"""
@@ -19,19 +19,19 @@ class DeploymentConfig:
     Options not given follow `--env.as-deployed`: with it they are as over the wire, without it off.
     """
 
-    tracker: bool | None = None
+    tracker: Annotated[bool | None, FIXED] = None
     """Drive the arm as `deploy` does: servo lag, the safety layer's limits, the 1 kHz tracker, and
     an arm that follows its set-points without lag."""
-    franka_hand: bool | None = None
+    franka_hand: Annotated[bool | None, FIXED] = None
     """Act as a Franka Hand: one command at a time, each runs to its end; a target of 0 grasps, any
     other width is a move. The width is read every 50 ms."""
-    estimated_wrench: bool | None = None
+    estimated_wrench: Annotated[bool | None, FIXED] = None
     """Observe the force on the hand as a real arm estimates it: with noise, bias, drift and lag."""
     state_delay: DelayRange | None = None
     """Least and largest age of joint positions, velocities and force in an observation, s."""
     picture_delay: DelayRange | None = None
     """Least and largest age of camera and tactile images in an observation, s."""
-    picture_rate: Annotated[float, Field(ge=5, le=1000)] | None = None
+    picture_rate: Annotated[float | None, Field(ge=5, le=1000), FIXED] = None
     """Frame rate of cameras and fingertip sensors, Hz. An observation holds the latest frame; as
     deployed 30 Hz, else one frame per millisecond."""
     command_delay: DelayRange | None = None

@@ -79,7 +79,7 @@ def _robot(arm: str, meshes: str) -> mujoco.MjSpec:
 def set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     """Set solver and drawing options of any scene with a fingertip."""
     option = spec.option
-    option.timestep = config.timestep
+    option.timestep = 1e-3  # s
     # `discrete` keeps implicit damping when an actuator saturates; with `implicitfast` MuJoCo
     # 4.0.0 shakes a grasped object several mm out of the hand at each set-point step.
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE

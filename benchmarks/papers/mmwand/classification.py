@@ -23,6 +23,7 @@ from benchmarks.papers.mmwand.fine_tuned import (
     read_pictures,
 )
 from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
+from benchmarks.papers.mmwand.splits import Fold
 from benchmarks.papers.mmwand.trained import (
     Trainable,
     embed_touches,
@@ -30,7 +31,6 @@ from benchmarks.papers.mmwand.trained import (
     train,
 )
 from touchgoal.encoders.alignment.config import AlignConfig
-from touchgoal.encoders.alignment.splits import Fold
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.options import TrainerOptions

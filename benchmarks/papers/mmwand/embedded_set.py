@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
+from benchmarks.papers.mmwand.splits import Fold, Split, split_touches
 from benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.control.arrays import Picture
-from touchgoal.encoders.alignment.config import Split
-from touchgoal.encoders.alignment.splits import Fold, split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.ssl.frames import find_sensor_name
 from touchgoal.encoders.towers.towers import load_towers

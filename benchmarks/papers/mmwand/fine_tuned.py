@@ -14,8 +14,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
+from benchmarks.papers.mmwand.splits import Fold
 from benchmarks.real_touch.embedders import difference_pictures
-from touchgoal.encoders.alignment.splits import Fold
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.efficientnet import FEATURES, load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised

@@ -22,6 +22,7 @@ from benchmarks.options import BenchmarkOptions
 from benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
 from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from benchmarks.papers.mmwand.real.captioned_set import embed_captioned
+from benchmarks.papers.mmwand.splits import SPLITS, Fold, Split
 from benchmarks.papers.mmwand.trained import (
     Trainable,
     embed_fold,
@@ -29,11 +30,10 @@ from benchmarks.papers.mmwand.trained import (
     train,
 )
 from benchmarks.published_touch.tvl import is_tvl
-from touchgoal.encoders.alignment.config import AlignConfig, HeadsConfig, Split
+from touchgoal.encoders.alignment.config import AlignConfig, HeadsConfig
 from touchgoal.encoders.alignment.data import TouchData
 from touchgoal.encoders.alignment.heads import PairedEmbeddings, fit_heads
 from touchgoal.encoders.alignment.retrieval import average_precisions
-from touchgoal.encoders.alignment.splits import SPLITS, Fold
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.encoders.training.options import TrainerOptions

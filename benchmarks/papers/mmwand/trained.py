@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 
+from benchmarks.papers.mmwand.splits import Fold
 from touchgoal.encoders.alignment.align import (
     AlignmentLoss,
     find_vit,
@@ -18,7 +19,6 @@ from touchgoal.encoders.alignment.align import (
 )
 from touchgoal.encoders.alignment.config import AlignConfig
 from touchgoal.encoders.alignment.data import TouchData, prepare_touch_data
-from touchgoal.encoders.alignment.splits import Fold
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.ssl.frames import find_sensor_name

@@ -6,14 +6,15 @@ sentences are on both sides, so a nearest neighbour in raw pixels scores high (R
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Int
 
-from touchgoal.encoders.alignment.config import Split
+from touchgoal.encoders.alignment.wand_set import draw_held_out
 
+Split = Literal["sample", "press", "object", "sentence"]
 SPLITS: tuple[Split, ...] = ("sample", "press", "object", "sentence")
-TEST_SHARE = 1048 / 5182  # the paper's share of test touches
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,20 +48,16 @@ def split_touches(
     """
     rng, every = np.random.default_rng([seed, 11]), np.ones(describes.shape[1], bool)
     if split == "object":
-        out = _some(rng, np.unique(label))
+        out = draw_held_out(rng, np.unique(label))
         test = np.isin(label, out)
         held = describes[out].sum(0) > 0
         return Fold(np.flatnonzero(~test), np.flatnonzero(test), ~held, held)
     if split == "press":
-        test = np.isin(visit, _some(rng, np.unique(visit)))
+        test = np.isin(visit, draw_held_out(rng, np.unique(visit)))
     else:
-        test = np.isin(np.arange(len(label)), _some(rng, np.arange(len(label))))
+        test = np.isin(np.arange(len(label)), draw_held_out(rng, np.arange(len(label))))
     if split == "sentence":
         held = np.zeros(describes.shape[1], bool)
         held[[rng.choice(np.flatnonzero(row)) for row in describes]] = True
         return Fold(np.flatnonzero(~test), np.flatnonzero(test), ~held, held)
     return Fold(np.flatnonzero(~test), np.flatnonzero(test), every, every)
-
-
-def _some(rng: np.random.Generator, items: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
-    return rng.permutation(items)[: round(TEST_SHARE * len(items))]
