@@ -362,6 +362,11 @@ ENVS: dict[TaskName, TaskConfig] = {
 """Environments in which policies are tried."""
 
 
+def task_name(config: EnvConfig) -> TaskName:
+    """Return the commands' name of a config's task."""
+    return next(name for name, kind in TASKS.items() if isinstance(config, kind))
+
+
 @checked_dataclass
 class RigConfig:
     """Options of the indenter rig."""

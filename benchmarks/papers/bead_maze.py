@@ -17,10 +17,11 @@ from pydantic import Field
 
 from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
 from touchgoal.encoders.backbones.sparsh import Method
 from touchgoal.encoders.pretrained import ENCODER_FORMAT
 from touchgoal.encoders.probes.bootstrap import percentile_interval
-from touchgoal.episodes.recording import Actor, EpisodeSpec, collect
+from touchgoal.episodes.recording import EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import LearnedPolicy
@@ -173,7 +174,7 @@ def _closed_loop(
     run_arm(f"follower, {HELD_OUT}", blind, [follower], other)
     for name, directories in arms.items():
         makers = [SavedPolicy(d) for d in directories]
-        env = makers[0].env_config(maze)
+        env = makers[0]().env_config(maze)
         run_arm(name, env, makers, jobs)
         run_arm(f"{name}, {HELD_OUT}", env, makers, other)
         if config.shuffled and checkpoint.load(directories[0]).config.touch_dim:
@@ -182,7 +183,7 @@ def _closed_loop(
     first = config.policies[0]
     for ticks in config.plan_ticks:
         late = SavedPolicy(first, plan_ticks=ticks)
-        run_arm(f"first policy, {ticks} ticks late", late.env_config(maze), [late], jobs)
+        run_arm(f"first policy, {ticks} ticks late", late().env_config(maze), [late], jobs)
     return results
 
 

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.recording import Actor, EpisodeSpec
+from touchgoal.control.interfaces import Actor
+from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.policies.acting import LearnedPolicy
-from touchgoal.policies.by_name import choose_policy, env_config_for
+from touchgoal.policies.by_name import choose_policy
 from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
@@ -34,13 +35,12 @@ class DaggerRoles:
     def __call__(self, env: FrankaTactileEnv, spec: EpisodeSpec) -> tuple[Actor, Actor]:
         """Return the actor, and the expert whose actions are recorded."""
         expert = FeedbackExpert(env) if isinstance(env, PickPlace) else make_expert(env)
-        if self.policy is None:
+        if (policy := self.policy) is None:
             return expert, expert
-        if isinstance(self.policy, SavedPolicy) and isinstance(env, PickPlace):
-            network = self.policy.network()
-            if network.config.estimated:
-                return LearnedPolicy(network, None, _NoisyTruth(env), env.plan_ticks), expert
-        actor = self.policy(env)
+        if isinstance(policy, SavedPolicy) and isinstance(env, PickPlace) and policy.is_estimated:
+            truth = _NoisyTruth(env)
+            return LearnedPolicy(policy.network(), None, truth, env.plan_ticks), expert
+        actor = policy(env)
         if isinstance(actor, LearnedPolicy):  # what is novel is what it must learn
             actor.refuses_novelty = False
         return actor, expert
@@ -57,9 +57,8 @@ def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> Dagger
         raise UserError("--env.release needs the planned expert: leave out --feedback and --policy")
     if policy is None or policy == "expert":
         return DaggerRoles()
-    maker = choose_policy(policy, task)
-    needed = env_config_for(maker, task)
-    if isinstance(maker, SavedPolicy) and maker.network().config.estimated:
+    maker, needed = choose_policy(policy, task)
+    if isinstance(maker, SavedPolicy) and maker.is_estimated:
         return DaggerRoles(maker)
     missing = [f"the {name} camera" for name in needed.cameras if name not in task.cameras]
     missing += ["the fingertips"] * (needed.tactile and not task.tactile)
