@@ -1,0 +1,57 @@
+# ruff: noqa: E402
+"""Imports `control`, loads the shipped policies and deploys one of one's own, the simulator blocked."""
+
+import importlib
+import sys
+from pathlib import Path
+from unittest.mock import patch
+
+from blocked_packages import SIMULATOR, Blocker
+
+Blocker(*SIMULATOR)
+
+import numpy as np
+from fake_cell import FakeCell, write_cell_file
+from toy_policies import DIFFUSION, toy_dataset, toy_policy
+
+from touchgoal.control import features as ft
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.launch.deploy import NOT_DONE, Config, main
+from touchgoal.launch.support import cell_run
+from touchgoal.policies import checkpoint
+from touchgoal.policies.network import PolicyConfig
+from touchgoal.runtime.errors import RefusedError
+
+for path in (root := Path(__file__).parents[1]).glob("control/**/*.py"):
+    importlib.import_module(".".join(("touchgoal", *path.relative_to(root).with_suffix("").parts)))
+
+blank = {key: np.zeros(kind.shape, kind.dtype) for key, kind in ft.FEATURES.items()}
+for name in ("bead-maze", "pick-place"):
+    policy = checkpoint.load_policy(name)
+    rows, columns = policy.env_config().camera_size
+    seen = blank | {ft.FRONT: np.zeros((rows, columns, 3), np.uint8)}
+    seen |= dict.fromkeys(ft.TACTILE, np.full((240, 320, 3), 120, np.uint8))
+    if name == "pick-place":
+        seen[ft.TCP_POSE] = policy._estimator.pose_estimator.tcp_normalizer.offset.numpy()
+    try:
+        assert policy.act(seen).shape == (8,)
+    except RefusedError:  # of a blank image
+        assert name == "pick-place"
+
+CELL = """
+arm = "sim"
+gripper = { kind = "franka_hand" }
+task = { name = "pick-place", policy = "POLICY", seconds = 0.5 }
+"""
+folder, fake = Path(sys.argv[1]), FakeCell()
+config = PolicyConfig(touch_dim=0, touch="", head=DIFFUSION, task="pick-place")
+checkpoint.save(toy_policy(config, toy_dataset(config)), folder / "own", {})
+cell = write_cell_file(folder, CELL.replace("POLICY", str(folder / "own")))
+for execute in (False, True):
+    with patch.object(cell_run, "connect", lambda cell: fake.connection()):
+        try:
+            main(Config(cell, execute=execute, yes=True, out=folder / "run"))
+        except SystemExit as end:
+            assert end.code == NOT_DONE and execute  # time was up
+assert EpisodeSet(folder / "run/episodes").lengths[0] == 10
+assert not set(SIMULATOR) & set(sys.modules)
