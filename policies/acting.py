@@ -148,7 +148,7 @@ class LearnedPolicy(Planner):
             actions[:, :-1] *= self._speed(history[-1])
             width = float(actions[self.execution_horizon - 1, -1])
             if self._width not in (None, width):
-                self._key_pose.go_on()
+                self._key_pose.change_gripper()
             self._width = width
             return actions
 

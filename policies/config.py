@@ -102,7 +102,7 @@ class PoseEstimatorConfig:
     """Crop of each camera's images that shows the table: column of the episodes, then rows and
     columns (from, to; from, to), px."""
     scene_keypoints: Count = 16
-    """Keypoints of the whole image at half its size, which show how the camera stands."""
+    """Keypoints of the whole image at half its size, from which the camera's pose follows."""
     finder_channels: Count = 48
     """Feature maps of the first look, which finds object and goal; cells of 8 x 8 pixels."""
     look: Count = 64

@@ -1,4 +1,4 @@
-"""Demonstrations by experts that can be asked in any state, also while a policy acts (DAgger)."""
+"""Demonstrations by an expert that labels any state, also while a policy acts (DAgger)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -28,8 +28,8 @@ _START_ERROR = np.array([0.003, 0.003, 0.0015, 0.03, 0.03, 0.0015, 0.0015])
 class DaggerRoles:
     """Actor and expert of a recording, see `Roles` in `episodes/recording.py`."""
 
-    # makes the policy that acts while the expert's actions are recorded (DAgger, Ross et al. 2011),
-    # on true states with noise if it has a state estimator. None: the expert itself acts
+    # makes the policy that acts while the expert's actions are recorded (DAgger, Ross et al. 2011);
+    # a policy with a state estimator gets true states with noise. None: the expert itself acts
     policy: Callable[[Any], Actor] | None = None
 
     def __call__(self, env: FrankaTactileEnv, spec: EpisodeSpec) -> tuple[Actor, Actor]:
@@ -41,13 +41,13 @@ class DaggerRoles:
             truth = _NoisyTruth(env)
             return LearnedPolicy(policy.network(), None, truth, env.plan_ticks), expert
         actor = policy(env)
-        if isinstance(actor, LearnedPolicy):  # what is novel is what it must learn
+        if isinstance(actor, LearnedPolicy):  # it must learn from novel states
             actor.refuses_novelty = False
         return actor, expert
 
 
 def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> DaggerRoles:
-    """Return the roles of a recording by an expert that is asked at every tick, also while it acts.
+    """Return the roles of a recording by an expert that gives an action at every tick.
 
     UserError: the policy or the expert cannot act in the task.
     """
@@ -70,7 +70,7 @@ def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> Dagger
 
 
 class _NoisyTruth:
-    """The simulator's truth, with an error that stays for an episode as a pose estimator's does."""
+    """Ground truth with an error that is constant within an episode, as a pose estimator's is."""
 
     def __init__(self, env: PickPlace) -> None:
         self._env = env

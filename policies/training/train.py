@@ -71,7 +71,7 @@ def train(
             folders.append(out_dir / SNAPSHOTS / f"epoch-{len(history):04d}")
         if folders and averaged.key_pose:
             batch = _validation_batch(averaged, validation)
-            averaged.calibrate_sight(_observed(batch), batch["key_pose"])
+            averaged.calibrate_key_poses(_observed(batch), batch["key_pose"])
         for folder in folders:
             on_first_process(partial(checkpoint.save, averaged, folder, provenance | known))
 
@@ -167,7 +167,7 @@ def _observed(batch: dict[str, Any]) -> ObservationBatch:
 
 @torch.no_grad()
 def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dict[str, float]:
-    """Return the loss, the error of the joint change (rad) planned over the chunk, and of sight (m)."""
+    """Return the loss, the error of the joint change (rad) planned over the chunk, and of key poses (m)."""
     batch = _validation_batch(policy, windows)
     generator = torch.Generator().manual_seed(seed)
     observed = _observed(batch)
