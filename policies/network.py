@@ -313,7 +313,8 @@ class PolicyNetwork(nn.Module):
         """Add the cameras' estimates to the average; return it as from `true_pose`."""
         assert self.key_pose and batch.maps is not None, "needs the cameras' feature maps"
         tcp, width = self._hand(batch.state[:, -1])
-        return average.add(*self.key_pose(batch.maps.float(), tcp, width), tcp)
+        estimate, weight = self.key_pose(batch.maps.float(), tcp, width)
+        return average.add(estimate, weight, tcp)
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None

@@ -1,7 +1,7 @@
 """Bead maze: success on unseen wires, and errors along recorded ones (TacBench T5, Sparsh Table 10).
 
 Policies of one recipe count as one group, its training seeds as repeats. All groups get the same
-wires and starts. The open-loop part is in `policies/evaluation/open_loop.py`.
+wires and starts. The open-loop part is in `open_loop.py`.
 """
 
 import tempfile
@@ -16,6 +16,8 @@ from jaxtyping import Float
 from pydantic import Field
 
 from benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.papers import open_loop
+from benchmarks.papers.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
 from touchgoal.encoders.backbones.sparsh import Method
@@ -27,9 +29,7 @@ from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.by_name import follower
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
-from touchgoal.policies.evaluation import open_loop
 from touchgoal.policies.evaluation.evaluate import REFUSED, Trial, run_trials
-from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.heads.mlp import MLPConfig
