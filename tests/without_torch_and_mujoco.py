@@ -57,8 +57,8 @@ def run(folder: Path, policy: str, seconds: float) -> tuple[Result, FakeCell]:
     return session.run(), fake
 
 
-for path in (Path(__file__).parents[1] / "control" / "deployment").glob("*.py"):
-    importlib.import_module(f"touchgoal.control.deployment.{path.stem}")
+for path in (root := Path(__file__).parents[1]).glob("control/**/*.py"):
+    importlib.import_module(".".join(("touchgoal", *path.relative_to(root).with_suffix("").parts)))
 assert not set(BLOCKED) & set(sys.modules)
 assert parse(deploy.Config, ["sim"], prog="deploy", description="", envs=None).cell == Path("sim")
 with tempfile.TemporaryDirectory() as name:
