@@ -1,16 +1,18 @@
-"""Interfaces of arm, gripper, camera, fingertip, load cell and actor.
+"""Interfaces of arm, gripper, camera, fingertip, load cell, policy and actor.
 
 Every reading is a frozen snapshot with `stamp`, the monotonic time (s) at which its content was
 new: a driver without news returns the old reading, so that its age shows. `read` and `command` wait
 for hardware no longer than a time-out; a device that is broken for good raises DriverError.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
+from touchgoal.control import features as ft
 from touchgoal.control.arrays import Picture
 from touchgoal.control.features import Observation
 from touchgoal.control.tactile.sensor_models import SensorModel
@@ -157,8 +159,23 @@ class LoadCell(Protocol):
         """Release the port."""
 
 
+@runtime_checkable
+class Policy(Protocol):
+    """A policy as a user writes it: two methods."""
+
+    def reset(self) -> None:
+        """Begin an episode."""
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """Return the action of the next tick: joint change (rad, one a joint), gripper's width (m).
+
+        Keys and units of the observation: `control/features.py`.
+        """
+        ...
+
+
 class Actor:
-    """Source of actions in the control loop; `act` returns in less than a tick."""
+    """Source of actions in a control loop or an environment; on an arm `act` takes less than a tick."""
 
     done = False  #: whether its plan has ended
     action_age = 0.0  #: s for which it has had no new answer
@@ -172,3 +189,26 @@ class Actor:
 
     def close(self) -> None:
         """End what `start` began."""
+
+
+class Planner(Actor):
+    """Policy that plans several ticks from one observation; by default a single tick."""
+
+    history_ticks = 1  #: number of observations that `plan` takes, the latest one last
+    observation_horizon = 1  #: ticks of these that the policy observes, the latest included
+    execution_horizon = 1  #: ticks of a plan that are executed before the next plan
+    control_hz = ft.CONTROL_HZ  #: ticks per second
+
+    def reset(self) -> None:
+        """Begin an episode."""
+
+    def embed(self, observations: Sequence[Observation], /) -> None:
+        """Do the part of `plan` that can be done before it; by default none."""
+
+    def plan(self, observations: Sequence[Observation], /) -> Float32[np.ndarray, "h a"]:
+        """Return the actions from the latest observation on."""
+        raise NotImplementedError
+
+    def env_config(self, config: Any, /) -> Any:
+        """Return an environment's options with the images that the policy reads; by default unchanged."""
+        return config

@@ -6,7 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import Description, EncodedEpisode, encode
 from touchgoal.episodes.outcomes.verify import outcome_reached
@@ -27,15 +28,6 @@ from touchgoal.sim_envs.config import Outcome, TaskConfig
 from touchgoal.sim_envs.scene.filming import SceneRecorder
 from touchgoal.sim_envs.scene.objects import CATALOGUE, of_same_shape
 from touchgoal.sim_envs.tasks import make_env, make_expert
-
-
-@runtime_checkable
-class Actor(Protocol):
-    """Anything that acts: an expert, a policy, a person."""
-
-    def act(self, observation: Observation) -> np.ndarray:
-        """Return the action (8,) for the next tick."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
     from touchgoal.control.cell.config import CellConfig
     from touchgoal.control.cell.connection import CellConnection
-    from touchgoal.control.deployment.actors import DeployedPolicy
     from touchgoal.control.deployment.control_loop import TickStatus
     from touchgoal.control.deployment.session import Result
+    from touchgoal.control.interfaces import Planner
     from touchgoal.runtime.viewer.stream import BackgroundStream
 
 NOT_DONE, STOPPED = 3, 4  # exit status
@@ -68,7 +68,7 @@ def main(config: Config) -> None:
 
     file = find_cell_file(config.cell)
     cell = read_cell_file(file, config.policy, config.sim, config.seed, config.task, config.target)
-    policy = load_policy(cell)
+    policy, camera_size = load_policy(cell)
     cost = None
     if cell.task.rewards:
         from touchgoal.rewards.online.cost_meter import load_cell_cost
@@ -81,7 +81,8 @@ def main(config: Config) -> None:
     try:
         connection = connect(cell)
         try:
-            result = _deploy(config, cell, policy, cost, connection, out / "episodes", stream)
+            loaded = policy, camera_size, cost
+            result = _deploy(config, cell, *loaded, connection, out / "episodes", stream)
         finally:
             connection.close()
             if cost is not None:
@@ -92,22 +93,38 @@ def main(config: Config) -> None:
     _report(result, out)
 
 
-def load_policy(cell: "CellConfig") -> "DeployedPolicy | None":
-    """Return the cell's policy, None for a scripted actor; UserError if it does not fit."""
-    from touchgoal.control.deployment.actors import SCRIPTED, load_user_policy
+def load_policy(cell: "CellConfig") -> "tuple[Planner | None, tuple[int, int]]":
+    """Return the cell's policy, None for a script, and the size of the camera images that it reads.
+
+    UserError: the policy does not fit the cell.
+    """
+    from touchgoal.control.deployment.actors import SCRIPTED, check_sensors
+    from touchgoal.control.deployment.user_policy import find_user_policy
     from touchgoal.sim_envs.twin.cell_task import env_config_of
 
-    if not cell.task.policy:
+    name, target, options = cell.task.policy, cell.task.target, env_config_of(cell)
+    if not name:
         raise UserError("task.policy is missing: name one in the cell file, or by --policy")
-    options = env_config_of(cell)
-    policy = None if cell.task.policy in SCRIPTED else load_user_policy(cell, options)
-    if policy is not None or cell.task.policy in SCRIPTED:
-        if cell.task.target is not None:
-            raise UserError(f"the policy {cell.task.policy} takes no target: leave it out")
-        return policy
-    from touchgoal.policies.by_name import load_saved_policy
+    make = find_user_policy(name, cell.task.instruction)
+    if target is not None and (make or name in SCRIPTED):
+        raise UserError(f"the policy {name} takes no target: leave it out")
+    if name in SCRIPTED:
+        return None, options.camera_size
+    if make:
+        policy = make()
+        policy.reset()
+        options = policy.env_config(options)
+    else:
+        from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy, find_policy
 
-    return load_saved_policy(cell, options)
+        if target is not None and EPISODE_OBJECT in target:
+            raise UserError(
+                f"{EPISODE_OBJECT} is known in run-policy alone: name the object itself"
+            )
+        policy = SavedPolicy(find_policy(name, cell.task.simulated)).with_target(target)()
+        options = policy.env_config(options, cell.task.name)
+    check_sensors(cell, options.tactile, options.cameras)
+    return policy, options.camera_size
 
 
 def _summary(cell: "CellConfig", config: Config) -> str:
@@ -119,7 +136,8 @@ def _summary(cell: "CellConfig", config: Config) -> str:
 def _deploy(
     config: Config,
     cell: "CellConfig",
-    policy: "DeployedPolicy | None",
+    policy: "Planner | None",
+    camera_size: tuple[int, int],
     cost: Any,
     connection: "CellConnection",
     episodes: Path,
@@ -127,7 +145,6 @@ def _deploy(
 ) -> "Result":
     from functools import partial
 
-    from touchgoal.control import features as ft
     from touchgoal.control.deployment.actors import make_actor
     from touchgoal.control.deployment.control_loop import Request
     from touchgoal.control.deployment.session import Session
@@ -158,7 +175,7 @@ def _deploy(
         operator_request=request,
         on_tick=on_tick,
         cost=cost.latest_cost if cost else None,
-        camera_size=policy.camera_size if policy else ft.CAMERA_SHAPE[:2],
+        camera_size=camera_size,
     )
     with terminal.watching():
         print(f"{'MOVING' if config.execute else 'dry run'}: {HELP}", flush=True)

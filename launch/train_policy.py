@@ -10,7 +10,7 @@ from touchgoal.policies.config import (
     ActionRepresentation,
     ArmState,
     Head,
-    SamplerConfig,
+    SamplerOptions,
     TouchInput,
     TrainConfig,
 )
@@ -23,8 +23,7 @@ from touchgoal.runtime.option_types import (
     Positive,
     checked_dataclass,
 )
-from touchgoal.sim_envs.config import ENVS as _ENVS
-from touchgoal.sim_envs.config import TaskConfig, TaskName
+from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, TaskConfig, TaskName
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,20 +33,17 @@ if TYPE_CHECKING:
     from touchgoal.policies.perception.frozen_touch import TouchEmbedder
     from touchgoal.policies.sight.frozen_images import ImageInputConfig
 
-ENVS: dict[TaskName, TaskConfig] = {"bead-maze": _ENVS["bead-maze"], **_ENVS}
-"""Default options of each task's environment; `--help` shows the first one's."""
 # Sparsh (C.7). It leaves open how many ticks of a plan are done (here all 8), at what rate, and for
 # how long to train (here the 600 epochs of diffusion_policy's real-robot tasks).
 _PAPER = {
     "head": "published",
     "representation": "delta",
     "touch_input": "embedding",
-    "touch_projection_dim": 256,
     "touch_noise": 0.0,
     "position_noise": 0.0,
     "execution_horizon": 8,
     "train": TrainConfig(epochs=600, lr=1e-4, snapshot_epochs=100),
-    "sampler": SamplerConfig("ddpm", "epsilon", num_train_timesteps=100, num_inference_steps=100),
+    "sampler": SamplerOptions("ddpm", num_train_timesteps=100, num_inference_steps=100),
 }
 # Fifty demonstrations of a task of one's own, by cameras and touch.
 _SIGHT = {
@@ -58,9 +54,28 @@ _SIGHT = {
     "head": "mlp",
     "action_share": 0.98,
     "execution_horizon": 6,
-    "train": TrainConfig(epochs=10, batch_size=64, lr=3e-3, warmup=300, snapshot_epochs=5),
-    "sampler": SamplerConfig(loss="absolute"),
+    "train": TrainConfig(epochs=10, batch_size=64, lr=3e-3, snapshot_epochs=5),
+    "sampler": SamplerOptions(loss="absolute"),
 }
+
+
+_PROJECTION_DIM = {"default": 64, "sight": 64, "paper": 256}  # width of the touch projection
+_WARMUP_STEPS = {"default": 500, "sight": 300, "paper": 500}
+_PROGRESS_SECONDS = 1.0  # s in which the progress of a window is made
+
+
+@checked_dataclass
+class TrialOptions:
+    """Options of the task in which snapshots are tried, in place of the task's defaults."""
+
+    as_deployed: bool = False
+    """Simulate the delays, limits and measurement errors of an arm driven by `deploy`."""
+    sensor: str = ""
+    """Folder of your own sensor file; default: the sensor that the episodes were recorded with."""
+    start_angle: float | None = None
+    """Bead maze: largest angle between hand and wire at the start, degrees."""
+    max_seconds: Positive | None = None
+    """Time limit of an episode, s."""
 
 
 @checked_dataclass
@@ -82,8 +97,6 @@ class Config(TrainingOptions):
     progress: Path | None = None
     """touchgoal_progress.parquet that reward-curves wrote for --data: failed episodes are taken, too, and
     what makes progress towards the goal is imitated (RA-BC)."""
-    progress_seconds: Annotated[Positive, RARE] = 1.0
-    """Time in which the progress is made, s."""
     trim_pauses: bool = False
     """Leave out the frames of each episode before arm or gripper first move."""
     task: str | None = None
@@ -125,8 +138,6 @@ class Config(TrainingOptions):
     """The policy stops once touch has been unlike all of the training for a second. For episodes in
     which an expert corrected a policy (make-policy): a limit from demonstrations alone also stops
     good runs."""
-    touch_projection_dim: Annotated[Count, RARE] = 64
-    """Width of that projection, with --touch-input embedding."""
     touch_noise: Annotated[NotNegative, RARE] = 0.1
     """Noise on touch embeddings in training, relative to their standard deviation."""
     position_noise: Annotated[NotNegative, RARE] = 0.3
@@ -141,12 +152,12 @@ class Config(TrainingOptions):
     """Control ticks of a plan that are executed before the next plan."""
     train: TrainConfig = TrainConfig()
     """Epochs, learning rate, batches."""
-    sampler: Annotated[SamplerConfig, RARE] = SamplerConfig()
+    sampler: Annotated[SamplerOptions, RARE] = SamplerOptions()
     """Noise schedule and denoising of a diffusion policy."""
     trials: CountOrNone = 24
     """Number of validation episodes in which every snapshot is tried; 0 takes the last snapshot."""
-    env: TaskConfig = ENVS["bead-maze"]
-    """Options of the task in which snapshots are tried; name it with --task."""
+    env: TrialOptions = TrialOptions()
+    """Options of the task in which snapshots are tried."""
     workers: Count = os.cpu_count() or 1
     """Processes that simulate."""
     ray: str | None = None
@@ -189,13 +200,11 @@ def main(config: Config) -> None:
     rows[0] = rows[0][: max(1, round(config.share * len(rows[0])))]
     chosen = list(zip(sets, rows, strict=True))
     task = training_data.find_task(chosen, config.task)
-    simulated = cast(TaskName, task) if task in ENVS else None
+    simulated = cast(TaskName, task) if task in TASKS else None
     trials = config.trials if simulated else 0
-    env = _env(config, simulated) if simulated else None
     reads_touch = config.encoder or config.end_to_end
     sensor = training_data.common_sensor(chosen) if reads_touch else ""
-    if env is not None and trials:
-        training_data.check_sensor(sensor, env.sensor)
+    env = _env(config.env, simulated, sensor) if simulated else None
     pauses = [training_data.find_pauses(*one) for one in chosen]
     policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
     out = open_training(config, "train-policy")
@@ -214,7 +223,8 @@ def main(config: Config) -> None:
     windows, validation = SequenceDataset(first, policy, weights), SequenceDataset(other, policy)
     print(f"{len(windows)} windows of {len(rows[0])} episodes; {len(validation)} for validation")
     provenance = recipe(*sets) | {"episodes": len(rows[0])}
-    train(policy, windows, validation, config.train, out, config, provenance)
+    warmup = _WARMUP_STEPS[config.preset]
+    train(policy, windows, validation, config.train, out, config, provenance, warmup)
     if not is_first_process():
         return
     copy_parts(out / POLICY, parts)
@@ -232,6 +242,7 @@ def _policy_config(
     config: Config, episodes: "EpisodeSet", touch: "TouchEmbedder | None"
 ) -> "PolicyConfig":
     from touchgoal.control import features as ft
+    from touchgoal.policies.config import SamplerConfig
     from touchgoal.policies.heads.diffusion import DiffusionConfig
     from touchgoal.policies.heads.mlp import MLPConfig
     from touchgoal.policies.heads.unet import PRESETS
@@ -245,12 +256,15 @@ def _policy_config(
     head = MLPConfig()
     if config.head != "regression":
         denoiser = MLPConfig() if config.head == "mlp" else PRESETS[config.head]
-        head = DiffusionConfig(denoiser, config.sampler)
+        predicts = "epsilon" if config.sampler.kind == "ddpm" else "sample"
+        head = DiffusionConfig(
+            denoiser, SamplerConfig(**vars(config.sampler), prediction_type=predicts)
+        )
     return PolicyConfig(
         touch_dim=touch.dim if touch else 0,
         touch=touch.name if touch else "",
         touch_input=config.touch_input,
-        touch_projection_dim=config.touch_projection_dim,
+        touch_projection_dim=_PROJECTION_DIM[config.preset],
         watches_novelty=config.refuse_unknown_touch,
         touch_noise=config.touch_noise,
         position_noise=config.position_noise,
@@ -274,7 +288,7 @@ def _weights(
     assert config.progress is not None
     progress = read_progress(config.progress, rows, [episodes.lengths[i] for i in rows])
     progress = [p[n:] for p, n in zip(progress, skip or [0] * len(rows), strict=True)]
-    weights = progress_weights(progress, round(config.progress_seconds * episodes.fps))
+    weights = progress_weights(progress, round(_PROGRESS_SECONDS * episodes.fps))
     print(f"imitated: {(weights > 0).mean():.0%} of the windows, which make progress")
     return weights
 
@@ -302,13 +316,14 @@ def _image_input(config: Config, episodes: "EpisodeSet") -> "ImageInputConfig | 
     return ImageInputConfig(keys, (height, width))
 
 
-def _env(config: Config, task: TaskName) -> TaskConfig:
+def _env(options: TrialOptions, task: TaskName, sensor: str) -> TaskConfig:
+    from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.runtime.errors import UserError
+    from touchgoal.sim_envs.config import ENVS
 
-    if type(config.env) is type(ENVS[task]):
-        return config.env
-    if config.env not in ENVS.values():
-        raise UserError(
-            f"the episodes are of {task}: add --task {task}, to which --env.* then belong"
-        )
-    return ENVS[task]
+    env, given = ENVS[task], {name: value for name, value in vars(options).items() if value}
+    if "start_angle" in given and not isinstance(env, BeadMazeConfig):
+        raise UserError(f"--env.start-angle is for bead-maze, the episodes are of {task}")
+    if options.sensor and sensor not in ("", find_sensor(options.sensor).name):
+        raise UserError(f"--env.sensor: the episodes were recorded with {sensor}: leave it out")
+    return replace(env, **{"sensor": sensor or env.sensor} | given)

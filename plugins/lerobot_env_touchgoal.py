@@ -13,7 +13,7 @@ from lerobot.envs.configs import EnvConfig
 
 import touchgoal
 from touchgoal.control.features import CAMERAS, CONTROL_HZ, IMAGE_PREFIX, TACTILE, TRUTH_SUCCESS
-from touchgoal.policies.checkpoint import SavedPolicy, find_policy
+from touchgoal.policies.checkpoint import load_policy
 from touchgoal.sim_envs.config import TASKS, TaskName
 
 IMAGES = *CAMERAS, *TACTILE
@@ -30,7 +30,7 @@ class LeRobotEnv(gym.Wrapper[Values, np.ndarray, Values, np.ndarray]):
     def __init__(self, task: TaskName, for_policy: str, render_mode: str | None = None) -> None:
         config = TASKS[task]()
         if for_policy:
-            config = SavedPolicy(find_policy(for_policy)).env_config(config)
+            config = load_policy(for_policy).env_config(config)
         super().__init__(touchgoal.make(task, config=config, render_mode=render_mode))
         self.task = task
         self._max_episode_steps = round(config.max_seconds * config.control_hz)

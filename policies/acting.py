@@ -13,6 +13,7 @@ from torch import Tensor
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Planner
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.policies.network import NOVEL_SECONDS, ObservationBatch, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import difference_images
@@ -22,8 +23,7 @@ from touchgoal.policies.perception.state_estimation import StateEstimator
 from touchgoal.policies.sight.average import KeyPoseAverage
 from touchgoal.policies.sight.frozen_images import ImageEmbedder
 from touchgoal.runtime.errors import RefusedError, UserError
-from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskName
-from touchgoal.sim_envs.tasks import task_name
+from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskName, task_name
 
 Task = TypeVar("Task", bound=EnvConfig)
 
@@ -41,7 +41,7 @@ class Estimator(Protocol):
         ...
 
 
-class LearnedPolicy:
+class LearnedPolicy(Planner):
     """A trained network that acts, one episode after the other.
 
     It executes `execution_horizon` ticks of each plan, slower if what it observes is late
@@ -57,8 +57,6 @@ class LearnedPolicy:
             much earlier, and its actions for the ticks gone by are dropped.
         refuses_novelty: whether `plan` raises RefusedError once touch has been unlike the training
             for a second; set False to correct it there.
-        history_ticks: number of observations that `plan` takes: the network's own, and those before
-            them that the touch encoder looks back to.
     """
 
     def __init__(
@@ -92,6 +90,9 @@ class LearnedPolicy:
         self.plan_ticks, self.directory = plan_ticks, directory
         self.refuses_novelty = True
         self._check_delay(plan_ticks)
+        self.observation_horizon = config.observation_horizon
+        self.execution_horizon, self.control_hz = config.execution_horizon, config.control_hz
+        # the network's own observations, and those before them that the touch encoder looks back to
         self.history_ticks = config.observation_horizon + (touch.reach if touch else 0)
         self.reset()
 
@@ -106,14 +107,14 @@ class LearnedPolicy:
         self._maps: tuple[Observation, Tensor] | None = None  # the latest embedded camera images
         self._recent: list[Observation] = []
         self._novel_plans = 0  # in a row
-        self._key_pose = KeyPoseAverage(self.config.execution_horizon / self.config.control_hz)
+        self._key_pose = KeyPoseAverage(self.execution_horizon / self.control_hz)
         self._width: float | None = None  # of the gripper, where the next plan begins, m
         self._todo: list[np.ndarray] = []  # actions of the present plan
         self._next: list[np.ndarray] = []  # actions of the plan that comes next
 
     def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
         """Return the action (`features.ACTION`) for the next tick."""
-        horizon, first = self.config.execution_horizon, not self._recent
+        horizon, first = self.execution_horizon, not self._recent
         before = self._recent or [observation] * self.history_ticks
         self._recent = [*before[1:], observation]
         if first:
@@ -130,7 +131,7 @@ class LearnedPolicy:
         if not self._todo:
             self._todo, self._next = self._next, []
 
-    def plan(self, history: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
+    def plan(self, history: Sequence[Observation], /) -> Float32[np.ndarray, "h 8"]:
         """Return actions, the first for the latest of `history_ticks` observations (oldest first).
 
         In an episode's first call the oldest observation is the untouched first one.
@@ -145,9 +146,9 @@ class LearnedPolicy:
             rest = self._generator, self._width, self._key_pose
             actions = self._network.plan(batch, *rest)[0].numpy()
             actions[:, :-1] *= self._speed(history[-1])
-            width = float(actions[self.config.execution_horizon - 1, -1])
+            width = float(actions[self.execution_horizon - 1, -1])
             if self._width not in (None, width):
-                self._key_pose.go_on()
+                self._key_pose.change_gripper()
             self._width = width
             return actions
 
@@ -155,7 +156,7 @@ class LearnedPolicy:
         """Return the share of the planned motion to do; all of it where no age is known."""
         age = observation.get(ft.AGE, np.zeros(1)).item()
         # The last action of a plan comes a tick and `execution_horizon` ticks after its observation.
-        reaction = (1 + self.config.execution_horizon) / self.config.control_hz
+        reaction = (1 + self.execution_horizon) / self.control_hz
         return speed_for_age(age, reaction)
 
     def _refuse_novel(self, batch: ObservationBatch) -> None:
@@ -164,17 +165,17 @@ class LearnedPolicy:
             return
         novelty = self._network.novelty_of(batch)
         self._novel_plans = self._novel_plans + 1 if novelty > 1 else 0
-        ticks = self._novel_plans * self.config.execution_horizon
-        if ticks >= NOVEL_SECONDS * self.config.control_hz:
+        ticks = self._novel_plans * self.execution_horizon
+        if ticks >= NOVEL_SECONDS * self.control_hz:
             raise RefusedError(
                 f"for a second touch has been unlike all of the training ({novelty:.1f} times "
                 "as far from it as accepted): look for what has changed since the recordings"
             )
 
-    def embed(self, history: Sequence[Observation]) -> None:
+    def embed(self, history: Sequence[Observation], /) -> None:
         """Embed observations before `plan` needs them: most of the work."""
         self._first = self._first or history[0]
-        ends = range(len(history) - self.config.observation_horizon + 1, len(history) + 1)
+        ends = range(len(history) - self.observation_horizon + 1, len(history) + 1)
         with one_thread():
             self._embedded = [(history[end - 1], *self._embed_tick(history[:end])) for end in ends]
             self._feature_maps(history[-1])

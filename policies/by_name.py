@@ -1,63 +1,39 @@
-"""Policies by name: `expert`, `follower`, `shipped`, a folder, a user's class or a server.
-
-For the last two see `control/deployment/user_policy.py`.
-"""
+"""The policy that a command names: `expert`, `follower`, `shipped`, a folder, a user's class or a server."""
 
 import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from touchgoal.control.cell.config import CellConfig, SimulatedTask
-from touchgoal.control.deployment.actors import DeployedPolicy
 from touchgoal.control.deployment.follower import WireFollower
-from touchgoal.control.deployment.user_policy import Policy, UserPolicy, find_user_policy
-from touchgoal.control.policy_server.policy import PolicyServer
-from touchgoal.episodes.recording import Actor
+from touchgoal.control.deployment.user_policy import UserPolicy, find_user_policy
+from touchgoal.control.interfaces import Actor, Planner, Policy
 from touchgoal.policies.acting import LearnedPolicy
-from touchgoal.policies.checkpoint import (
-    EPISODE_OBJECT,
-    SHIPPED_POLICIES,
-    SavedPolicy,
-    find_policy,
-    suggestion,
-    with_target,
-)
-from touchgoal.policies.config import POLICIES
+from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy, find_policy
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import PickPlaceConfig, TaskConfig
-from touchgoal.sim_envs.tasks import make_expert, task_name
-
-PolicyMaker = Callable[[Any], Actor]
-"""Makes the policy for one episode of an environment, after its reset; it must pickle."""
-AnyPolicy = str | Path | LearnedPolicy | Policy | type
-"""A name or folder as for `--policy`, a loaded policy, or a user's class or an object of it."""
-
-
-def scripted(task: SimulatedTask) -> str:
-    """Return the task's scripted policy that an arm can run."""
-    return "follower" if task == "bead-maze" else "expert"
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, task_name
+from touchgoal.sim_envs.tasks import make_expert
 
 
 def prepare_policy(
-    policy: AnyPolicy, task: TaskConfig, target: str | None = None
-) -> tuple[PolicyMaker, TaskConfig]:
-    """Return the maker of a policy, and the task's options with the images that it reads.
+    policy: str | Path | Policy | type, task: TaskConfig, target: str | None = None
+) -> tuple[Callable[[Any], Actor], TaskConfig]:
+    """Return what makes a policy for an episode, and the task's options with the images it reads.
 
-    `target` is the object in words, see `SavedPolicy`.
+    The first takes an environment after its reset, and pickles.
 
     UserError: no such policy, it cannot act in the task, an option of the task is set to
     something else than the policy needs, or it takes no target.
+
+    Args:
+        policy: a name or folder as for `--policy`, a loaded policy, or a user's class or an object of it.
+        target: the object in words, see `SavedPolicy`.
     """
-    maker = choose_policy(policy, task)
-    if isinstance(maker, SavedPolicy):
-        maker = with_target(maker, target)
-        _warn_without_target(maker, task)
-    elif target is not None:
-        raise UserError(f"the policy {policy} takes no target: leave it out")
-    needed = env_config_for(maker, task)
+    make, needed = choose_policy(policy, task, target)
+    if isinstance(make, SavedPolicy):
+        _warn_without_target(make, task)
     default = type(task)()
     for name in (field.name for field in fields(task)):
         given, runs = getattr(task, name), getattr(needed, name)
@@ -67,7 +43,40 @@ def prepare_policy(
             raise UserError(
                 f"{_option(name, given)}: the policy {policy} {instead}; leave the option out"
             )
-    return maker, needed
+    return make, needed
+
+
+def choose_policy(
+    policy: str | Path | Policy | type, task: TaskConfig, target: str | None = None
+) -> tuple[Callable[[Any], Actor], TaskConfig]:
+    """Return what `prepare_policy` does, without a check of the task's options."""
+    if policy in ("expert", "follower"):
+        make = make_expert if policy == "expert" else follower
+        if make is follower and not isinstance(task, BeadMazeConfig):
+            raise UserError("the follower is for the bead maze; add: --task bead-maze")
+        needed = replace(task, tactile=False, cameras=())
+    else:
+        make = _maker(policy, task_name(task))
+        if isinstance(make, SavedPolicy):
+            make, target = make.with_target(target), None
+        needed = make().env_config(task)
+    if target is not None:
+        raise UserError(f"the policy {policy} takes no target: leave it out")
+    return make, needed
+
+
+def _maker(policy: str | Path | Policy | type, task: str) -> Callable[..., Planner]:
+    if isinstance(policy, LearnedPolicy) and policy.directory is not None:
+        return SavedPolicy(policy.directory, policy.plan_ticks, policy.target)
+    if not isinstance(policy, str | Path):
+        kind = policy if isinstance(policy, type) else type(policy)
+        return partial(UserPolicy, kind.__name__, policy)
+    return find_user_policy(str(policy)) or SavedPolicy(find_policy(policy, task))
+
+
+def follower(env: Any) -> WireFollower:
+    """Return the bead maze's classical policy."""
+    return WireFollower(env.config.control_hz)
 
 
 def _warn_without_target(policy: SavedPolicy, task: TaskConfig) -> None:
@@ -86,65 +95,3 @@ def _option(name: str, value: object) -> str:
         return f"--env.{name}" if value else f"--env.no-{name}"
     words = map(str, value) if isinstance(value, tuple) else [str(value)]
     return " ".join([f"--env.{name}", *words])
-
-
-def choose_policy(policy: AnyPolicy, task: TaskConfig) -> PolicyMaker:
-    """Return the maker of a policy that is named, loaded, or a user's own.
-
-    UserError: no such policy.
-    """
-    if isinstance(policy, LearnedPolicy) and policy.directory is not None:
-        return SavedPolicy(policy.directory, policy.plan_ticks, policy.target)
-    if not isinstance(policy, str | Path):
-        kind = policy if isinstance(policy, type) else type(policy)
-        return UserPolicy(kind.__name__, policy)
-    name, where = str(policy), task_name(task)
-    if name == "expert":
-        return make_expert
-    if name == "follower":
-        if where != "bead-maze":
-            raise UserError("the follower is for the bead maze; add: --task bead-maze")
-        return follower
-    if (found := find_user_policy(name)) is not None:
-        return found
-    if name == "shipped" and where not in SHIPPED_POLICIES:
-        raise UserError(f"no policy ships for {where}: train one, or take the expert")
-    if name == "shipped":
-        return SavedPolicy(SHIPPED_POLICIES[where])
-    try:
-        return SavedPolicy(find_policy(name))
-    except UserError as error:
-        if Path(name).is_dir():
-            raise UserError(
-                f"no policy in {name}: train one with touchgoal train-policy"
-            ) from error
-        raise UserError(
-            f"there is no policy {name!r}: {suggestion(name, tuple(POLICIES))}, or a class of your "
-            "own as module:Class or file.py:Class, or a server as ws://host:port"
-        ) from error
-
-
-def env_config_for(maker: PolicyMaker, task: TaskConfig) -> TaskConfig:
-    """Return the task's options with the images that the policy reads: no others are rendered.
-
-    UserError: the policy cannot act in the task.
-    """
-    if isinstance(maker, SavedPolicy | UserPolicy | PolicyServer):
-        return maker.env_config(task)
-    return replace(task, tactile=False, cameras=())
-
-
-def follower(env: FrankaTactileEnv) -> WireFollower:
-    """Return the bead maze's classical policy."""
-    return WireFollower(env.config.control_hz)
-
-
-def load_saved_policy(cell: CellConfig, task: TaskConfig) -> DeployedPolicy:
-    """Return the policy on disk that the cell names; UserError if it does not fit."""
-    shipped = cell.task.policy == "shipped"
-    directory = SHIPPED_POLICIES[cell.task.simulated] if shipped else find_policy(cell.task.policy)
-    target = cell.task.target
-    if target is not None and EPISODE_OBJECT in target:
-        raise UserError(f"{EPISODE_OBJECT} is known in run-policy alone: name the object itself")
-    policy = with_target(SavedPolicy(directory), target)()
-    return DeployedPolicy.for_cell(cell, policy, policy.env_config(task, cell.task.name))

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from touchgoal.encoders.training.weights import WeightsFormat
-from touchgoal.policies.acting import LearnedPolicy, Task
-from touchgoal.policies.config import SamplerConfig
+from touchgoal.policies.acting import LearnedPolicy
+from touchgoal.policies.config import POLICIES, SamplerConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.heads.unet import UNetConfig
@@ -18,14 +18,9 @@ from touchgoal.policies.network import PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
-from touchgoal.policies.perception.state_estimation import (
-    StateEstimator,
-    load_pose_estimator,
-)
+from touchgoal.policies.perception.state_estimation import StateEstimator, load_pose_estimator
 from touchgoal.policies.sight.frozen_images import ImageInputConfig
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.pick_place import PickPlace
 
 TOUCH, ESTIMATOR = "touch", "estimator"  # folders beside a policy's weights
 EPISODE_OBJECT = "{object}"  # in a target: the object that the simulated episode asks for
@@ -74,24 +69,32 @@ class SavedPolicy:
     plan_ticks: int = 0
     target: str = ""
 
-    def __call__(self, env: FrankaTactileEnv | None = None) -> LearnedPolicy:
+    def __call__(self, env: Any = None) -> LearnedPolicy:
         """Return the policy at an episode's beginning; its plans come as late as `env` says."""
         network, touch, pose_estimator = _load_parts(self.directory, _stamp(self.directory))
         target = self.target
-        if isinstance(env, PickPlace):
+        if env and EPISODE_OBJECT in target:
             target = target.replace(EPISODE_OBJECT, env.asked_name)
         estimator = StateEstimator(pose_estimator, target) if pose_estimator else None
         plan_ticks = max(self.plan_ticks, env.plan_ticks if env else 0)
         return LearnedPolicy(network, touch, estimator, plan_ticks, self.directory)
 
-    def env_config(self, task: Task) -> Task:
-        """Return the task's options with the images that the policy reads, see `LearnedPolicy`."""
-        return self().env_config(task)
-
     @property
-    def reads_words(self) -> bool:
-        """Whether it takes the object to pick up, in words."""
+    def is_estimated(self) -> bool:
+        """Whether a pose estimator finds the object to pick up, which words may name."""
         return bool(self.network().config.estimated)
+
+    def with_target(self, target: str | None) -> "SavedPolicy":
+        """Return the policy with a target; UserError if that is empty, or the policy takes none."""
+        if target is None:
+            return self
+        if not target.strip():
+            raise UserError(
+                'the target is empty: name the object in words, such as "the red block"'
+            )
+        if not self.is_estimated:
+            raise UserError(f"the policy in {self.directory} takes no target: leave it out")
+        return replace(self, target=target)
 
     def network(self) -> PolicyNetwork:
         """Return the network alone."""
@@ -135,36 +138,37 @@ def load_policy(name_or_path: str | Path, target: str | None = None) -> LearnedP
     Raises:
         UserError: no such policy, or it is damaged, or it takes no target.
     """
-    return with_target(SavedPolicy(find_policy(name_or_path)), target)()
+    return SavedPolicy(find_policy(name_or_path)).with_target(target)()
 
 
-def with_target(policy: SavedPolicy, target: str | None) -> SavedPolicy:
-    """Return the policy with a target; UserError if that is empty, or the policy takes none."""
-    if target is None:
-        return policy
-    if not target.strip():
-        raise UserError('the target is empty: name the object in words, such as "the red block"')
-    if not policy.reads_words:
-        raise UserError(f"the policy in {policy.directory} takes no target: leave it out")
-    return replace(policy, target=target)
+def find_policy(name_or_path: str | Path, task: str = "") -> Path:
+    """Return the folder of a shipped policy or of one on disk; UserError if there is none.
 
-
-def find_policy(name_or_path: str | Path) -> Path:
-    """Return the folder of a shipped policy or of one on disk; UserError if there is none."""
-    name = str(name_or_path)
-    if shipped := (SHIPPED_POLICIES | FURTHER_POLICIES).get(name):
-        return shipped
-    for folder in (Path(name), Path(name) / "policy"):  # train-policy's --out, too
-        if POLICY_FORMAT.weights_path(folder).is_file():
+    A command names its `task`: then "shipped" is that task's, and the message lists what else
+    `--policy` takes.
+    """
+    name, folders = str(name_or_path), SHIPPED_POLICIES | FURTHER_POLICIES
+    if name == "shipped" and task:
+        if task not in SHIPPED_POLICIES:
+            raise UserError(f"no policy ships for {task}: train one, or take the expert")
+        return SHIPPED_POLICIES[task]
+    for folder in (
+        folders.get(name),
+        Path(name),
+        Path(name) / "policy",
+    ):  # train-policy's --out, too
+        if folder and POLICY_FORMAT.weights_path(folder).is_file():
             return folder
-    raise UserError(f"there is no policy {name!r}: {suggestion(name)}")
-
-
-def suggestion(name: str, names: tuple[str, ...] = (*SHIPPED_POLICIES, *FURTHER_POLICIES)) -> str:
-    """Return the end of a message about an unknown policy: the nearest name, and what there is."""
+    if Path(name).is_dir():
+        raise UserError(f"no policy in {name}: train one with touchgoal train-policy")
+    names = POLICIES if task else folders
     close = get_close_matches(name, names, 1)
     guess = f"did you mean {close[0]}? " if close else ""
-    return f"{guess}choose from {', '.join(names)}, or name a folder that train-policy or pull made"
+    others = ", a class of your own as module:Class or file.py:Class, or a server as ws://host:port"
+    raise UserError(
+        f"there is no policy {name!r}: {guess}choose from {', '.join(names)}, or name a folder that "
+        f"train-policy or pull made{others if task else ''}"
+    )
 
 
 def _config(fields: dict[str, Any]) -> PolicyConfig:

@@ -7,11 +7,7 @@ from pydantic import Field
 from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import (
-    RARE,
     Count,
-    CountOrNone,
-    Fraction,
-    NotNegative,
     Positive,
     checked_dataclass,
 )
@@ -39,35 +35,44 @@ POLICIES = {
 
 
 @checked_dataclass
-class SamplerConfig:
+class SamplerOptions:
     """Noise schedule in training, and denoising when a plan is made."""
 
     kind: Literal["ddpm", "ddim", "flow"] = "ddim"
-    """ddpm draws fresh noise at every step (Ho et al. 2020), ddim none (Song et al. 2021); both
-    train the same network. flow goes straight from noise to data (Lipman et al. 2023)."""
-    prediction_type: Literal["epsilon", "velocity", "sample"] = "sample"
-    """Prediction of the network: the noise (epsilon) or the flow's velocity, as published, or the
-    clean sample, which needs fewer steps and less training where samples vary little (Ze et al.
-    2024)."""
+    """ddpm draws fresh noise at every step (Ho et al. 2020) and predicts the noise, as published; ddim
+    draws none (Song et al. 2021); flow goes straight from noise to data (Lipman et al. 2023)."""
     num_train_timesteps: Annotated[int, Field(ge=2)] = 100
     """Steps of the squared-cosine noise schedule (Nichol and Dhariwal 2021)."""
     num_inference_steps: Count = 2
-    """Network calls for one plan. Two suffice for ddim with sample, not for ddpm with epsilon."""
-    clip: Positive = 1.0
-    """Largest magnitude of a clean sample, normalised."""
+    """Network calls for one plan. Two suffice for ddim, not for ddpm."""
     loss: Literal["squared", "absolute"] = "squared"
     """Error of the network in training: squared, as published, or absolute, which weighs rare large
     motions less."""
 
     def __post_init__(self) -> None:
-        if self.prediction_type == ("epsilon" if self.kind == "flow" else "velocity"):
-            raise UserError(
-                f"a network for {self.kind} cannot predict {self.prediction_type}: try sample"
-            )
         if self.kind != "flow" and self.num_inference_steps > self.num_train_timesteps:
             raise UserError(
                 f"num_inference_steps {self.num_inference_steps} exceed num_train_timesteps "
                 f"{self.num_train_timesteps}: some would do nothing, so ask for fewer"
+            )
+
+
+@checked_dataclass
+class SamplerConfig(SamplerOptions):
+    """Sampler of a diffusion head."""
+
+    prediction_type: Literal["epsilon", "velocity", "sample"] = "sample"
+    """Prediction of the network: the noise (epsilon) or the flow's velocity, as published, or the
+    clean sample, which needs fewer steps and less training where samples vary little (Ze et al.
+    2024)."""
+    clip: Positive = 1.0
+    """Largest magnitude of a clean sample, normalised."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.prediction_type == ("epsilon" if self.kind == "flow" else "velocity"):
+            raise UserError(
+                f"a network for {self.kind} cannot predict {self.prediction_type}: try sample"
             )
 
 
@@ -81,16 +86,8 @@ class TrainConfig:
     """Sequences in each step; all of them if there are fewer."""
     lr: Positive = 5e-4
     """Highest learning rate of AdamW, after a linear rise from 0 and before a cosine to 0."""
-    betas: Annotated[tuple[Fraction, Fraction], RARE] = (0.95, 0.999)
-    """Decay rates of AdamW's running means of gradients and of their squares."""
-    weight_decay: Annotated[NotNegative, RARE] = 1e-6
-    """Weight decay of weight matrices and convolutions."""
-    warmup: Annotated[CountOrNone, RARE] = 500
-    """Steps in which the learning rate rises; a tenth of the training if that is shorter."""
     snapshot_epochs: Count = 10
     """Epochs between two snapshots of the policy; the last epoch makes one, too."""
-    validation_windows: Annotated[Count, RARE] = 1024
-    """Number of validation sequences for the losses, evenly spaced."""
 
 
 @checked_dataclass

@@ -41,7 +41,7 @@ from touchgoal.policies.sight.readout import KeyPoseReadout
 from touchgoal.runtime.errors import UserError
 
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
-_DRAWS = 8  # of the noise, for each window that is seen: sight is most of a training step's work
+_DRAWS = 8  # noise draws per window with cameras: the camera network costs most of a training step
 NOVEL_SECONDS = 1.0  # s for which novelty must last to count
 _CLIP = 5.0  # standard deviations
 
@@ -57,7 +57,7 @@ class PolicyConfig:
     # projection that is trained on the actions alone, for episodes without that truth
     touch_input: TouchInput = "wrench"
     touch_projection_dim: int = 64  # width of the projection, with "embedding"
-    watches_novelty: bool = False  # whether it tells touch that is unlike the training's
+    watches_novelty: bool = False  # whether it detects touch that is unlike the training's
     # standard deviation of noise on normalised embeddings in training. Without it the network
     # recognises each recorded episode by its sensors
     touch_noise: float = 0.1
@@ -69,8 +69,8 @@ class PolicyConfig:
     gripper_widths: tuple[float, ...] = ()
     end_to_end: EndToEndConfig | None = None  # touch encoder that is trained jointly; None without
     images: ImageInputConfig | None = None  # cameras, by a frozen image encoder; None without
-    # columns of `features.FEATURES`, the state first. Columns that only a simulator knows come from
-    # a state estimator on an arm. The wrench is tared, see `proprioception.tare`
+    # columns of `features.FEATURES`, the state first. Columns of ground truth come from a state
+    # estimator on an arm. The wrench is tared, see `proprioception.tare`
     proprioception: tuple[str, ...] = (ft.STATE, ft.TCP_POSE)
     observation_horizon: int = 2  # ticks observed, the latest included
     # ticks planned, from the latest observation on; diffusion_policy counts from the oldest one
@@ -228,11 +228,11 @@ class PolicyNetwork(nn.Module):
 
         With `reads_wrench` it needs the wrenches on both pads, with cameras the next key poses.
         """
-        pose, sight_loss = None, torch.zeros((), device=actions.device)
+        pose, key_pose_loss = None, torch.zeros((), device=actions.device)
         if self.key_pose:
             assert batch.maps is not None and key_pose is not None, "needs maps and key poses"
             hand = self._hand(batch.state[:, -1])
-            sight_loss = self.key_pose.loss(batch.maps.float(), *hand, key_pose[:, 1:])
+            key_pose_loss = self.key_pose.loss(batch.maps.float(), *hand, key_pose[:, 1:])
             pose = kp.true_pose(hand[0], key_pose)
             draws = 1 if self.end_to_end_encoder else _DRAWS
             rows = batch.touch, batch.state, batch.pictures, pose, actions, wrench, action_is_pad
@@ -250,19 +250,21 @@ class PolicyNetwork(nn.Module):
             touch = touch.detach()
         encoded = self._encode(batch, touch, pose, noise)
         loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
-        return loss + wrench_loss + sight_loss
+        return loss + wrench_loss + key_pose_loss
 
     @torch.no_grad()
     def key_pose_error(
         self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]
     ) -> Float[Tensor, "b 2"]:
-        """Return how far off sight sees the next key pose and the one after it, m."""
+        """Return the position errors of the next two estimated key poses, m."""
         assert self.key_pose and batch.maps is not None, "needs cameras"
         hand = self._hand(batch.state[:, -1])
         return self.key_pose.error(batch.maps.float(), *hand, key_pose[:, 1:])
 
-    def calibrate_sight(self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]) -> None:
-        """Scale the errors that the cameras expect to those on episodes that were not trained on."""
+    def calibrate_key_poses(
+        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]
+    ) -> None:
+        """Scale the cameras' expected errors to the actual ones on validation episodes."""
         assert self.key_pose and batch.maps is not None, "needs cameras"
         hand = self._hand(batch.state[:, -1])
         self.key_pose.calibrate(batch.maps.float(), *hand, key_pose[:, 1:])
@@ -286,16 +288,16 @@ class PolicyNetwork(nn.Module):
     ) -> Float[Tensor, "b h 8"]:
         """Return actions (`features.ACTION`) of the ticks from the latest observation on.
 
-        The same generator state (on the CPU) gives the same plan. `width` is the last plan's, m: with
-        cameras the gripper keeps it until the hand is at the next key pose. Then it needs the `average` of
-        what was seen in the episode, or the true key poses.
+        The same generator state (on the CPU) gives the same plan. With cameras the gripper keeps `width`
+        (m), the last plan's, until the hand is at the next key pose; this needs the `average` of the
+        episode's estimates, or the true key poses.
         """
         keeps, pose = average is not None and average.gripper_moves, None
         if self.key_pose and key_pose is not None:
             pose = kp.true_pose(self._hand(batch.state[:, -1])[0], key_pose)
         elif self.key_pose:
-            assert average is not None, "needs what was seen in the episode, or the true key poses"
-            pose = self._see(batch, average)
+            assert average is not None, "needs the episode's average, or the true key poses"
+            pose = self._estimate(batch, average)
         encoded = self._encode(batch, self._encode_touch(batch), pose)
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)
@@ -303,16 +305,16 @@ class PolicyNetwork(nn.Module):
             actions[..., -1] = nearest(actions[..., -1], widths)
             if pose is not None and width is not None:
                 tcp = torch.stack([self._hand(state)[0] for state in batch.state.unbind(1)], 1)
-                seen = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)
-                actions[..., -1] = width if keeps else seen
+                planned = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)
+                actions[..., -1] = width if keeps else planned
         return actions
 
-    def _see(self, batch: ObservationBatch, average: KeyPoseAverage) -> Float[Tensor, "b 11"]:
-        """Return the key poses in the hand's frame, as the cameras have shown them."""
+    def _estimate(self, batch: ObservationBatch, average: KeyPoseAverage) -> Float[Tensor, "b 11"]:
+        """Add the cameras' estimates to the average; return it as from `true_pose`."""
         assert self.key_pose and batch.maps is not None, "needs the cameras' feature maps"
         tcp, width = self._hand(batch.state[:, -1])
-        seen, weight = self.key_pose(batch.maps.float(), tcp, width)
-        return average.add(seen, weight, tcp)
+        estimate, weight = self.key_pose(batch.maps.float(), tcp, width)
+        return average.add(estimate, weight, tcp)
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None

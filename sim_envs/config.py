@@ -343,3 +343,8 @@ ENVS: dict[TaskName, TaskConfig] = {
     "fragile-carry": FragileCarryConfig(),
 }
 """Environments in which policies are tried."""
+
+
+def task_name(config: EnvConfig) -> TaskName:
+    """Return the commands' name of a config's task."""
+    return next(name for name, kind in TASKS.items() if isinstance(config, kind))

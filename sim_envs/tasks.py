@@ -4,14 +4,11 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import (
-    TASKS,
     BeadMazeConfig,
-    EnvConfig,
     FragileCarryConfig,
     Outcome,
     PickPlaceConfig,
     TaskConfig,
-    TaskName,
 )
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.experts.fragile_carry import FragileCarryExpert
@@ -29,11 +26,6 @@ ENVIRONMENTS: dict[type[TaskConfig], type[PickPlace | BeadMaze | FragileCarry]] 
 def make_env(config: TaskConfig) -> FrankaTactileEnv:
     """Make the environment of a task's config."""
     return ENVIRONMENTS[type(config)](config)
-
-
-def task_name(config: EnvConfig) -> TaskName:
-    """Return the commands' name of a config's task."""
-    return next(name for name, kind in TASKS.items() if isinstance(config, kind))
 
 
 def make_expert(

@@ -12,6 +12,7 @@ from toy_policies import (
     TOY,
     torch_rng,
     toy_dataset,
+    toy_network,
     toy_observations,
     toy_policy,
     toy_touch_embedder,
@@ -32,8 +33,7 @@ from touchgoal.sim_envs.config import PickPlaceConfig
 @pytest.mark.parametrize("plan_ticks", [0, 1, 3])
 def test_an_actor_does_its_plans_in_order_and_on_time(plan_ticks: int) -> None:
     touch = toy_touch_embedder()
-    config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
-    policy, ticks = toy_policy(config, toy_dataset(config)).eval(), toy_observations(8)
+    policy, ticks = toy_network(touch_dim=touch.dim, execution_horizon=3), toy_observations(8)
     actor = LearnedPolicy(policy, touch, plan_ticks=plan_ticks)
     actor.reset(seed=5)
     done = [actor.act(dict(tick)) for tick in ticks]  # nobody else keeps them
@@ -55,8 +55,7 @@ def test_an_actor_does_its_plans_in_order_and_on_time(plan_ticks: int) -> None:
 def test_late_observations_slow_the_arm_and_not_the_gripper() -> None:
     """The way until it reacts stays what it is at an age of 0.1 s."""
     touch = toy_touch_embedder()
-    config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
-    network, tick = toy_policy(config, toy_dataset(config)).eval(), toy_observations(1)[0]
+    network, tick = toy_network(touch_dim=touch.dim, execution_horizon=3), toy_observations(1)[0]
 
     def plan(age: float) -> np.ndarray:
         policy = LearnedPolicy(network, touch)
@@ -64,7 +63,7 @@ def test_late_observations_slow_the_arm_and_not_the_gripper() -> None:
 
     usual, late, later = plan(0.1), plan(0.2), plan(0.4)
     np.testing.assert_array_equal(plan(0.0), usual)
-    reaction = 4 / config.control_hz  # a tick for the plan, three that it acts
+    reaction = 4 / network.config.control_hz  # a tick for the plan, three that it acts
     for age, actions in ((0.2, late), (0.4, later)):
         way = actions[:, :-1] * (age + reaction)
         np.testing.assert_allclose(way, usual[:, :-1] * (0.1 + reaction), rtol=1e-5)
@@ -107,8 +106,9 @@ def test_a_second_of_touch_unlike_the_training_is_refused() -> None:
 class SlowPolicy(LearnedPolicy):
     """Takes its time; remembers its plans."""
 
-    def __init__(self, policy: PolicyNetwork, pause: float) -> None:
-        super().__init__(policy, None)
+    def __init__(self, execution_horizon: int, pause: float) -> None:
+        network = toy_network(touch_dim=0, touch="", execution_horizon=execution_horizon)
+        super().__init__(network, None)
         self.pause, self.plans = pause, []
 
     def plan(self, history):
@@ -120,8 +120,7 @@ class SlowPolicy(LearnedPolicy):
 
 def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
     """Every action is one that a plan meant for this very tick; none waits for a plan."""
-    config = replace(TOY, touch_dim=0, touch="", execution_horizon=3)
-    planner = SlowPolicy(toy_policy(config, toy_dataset(config)).eval(), pause=0.05)
+    planner = SlowPolicy(execution_horizon=3, pause=0.05)
     actor, done = RealTimeActor(planner), []
     for i, tick in enumerate(toy_observations(40)):
         tick[ft.STATE][0] = i
@@ -137,8 +136,7 @@ def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
 
 def test_one_tick_at_a_time_no_observation_is_planned_from_twice() -> None:
     """A slow planner that is asked a tick early for single ticks must not spin on the same one."""
-    config = replace(TOY, touch_dim=0, touch="", execution_horizon=1)
-    planner = SlowPolicy(toy_policy(config, toy_dataset(config)).eval(), pause=0.02)
+    planner = SlowPolicy(execution_horizon=1, pause=0.02)
     actor = RealTimeActor(planner, timeout=0.0)
     for tick in toy_observations(2):
         actor.act(tick)
@@ -152,8 +150,7 @@ def test_one_tick_at_a_time_no_observation_is_planned_from_twice() -> None:
 def test_however_quick_the_machine_a_plan_is_done_from_the_tick_after_its_observation() -> None:
     """Equals the simulation with plans that come a tick late."""
     touch = toy_touch_embedder()
-    config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
-    policy = toy_policy(config, toy_dataset(config)).eval()
+    policy = toy_network(touch_dim=touch.dim, execution_horizon=3)
     threaded = RealTimeActor(LearnedPolicy(policy, touch), timeout=20.0)
     plain = LearnedPolicy(policy, touch, plan_ticks=1)
     for i, tick in enumerate(toy_observations(10)):
@@ -163,9 +160,8 @@ def test_however_quick_the_machine_a_plan_is_done_from_the_tick_after_its_observ
 
 
 def test_a_planner_that_fails_later_is_not_waited_for() -> None:
-    config = replace(TOY, touch_dim=0, touch="", execution_horizon=1)
-    planner = LearnedPolicy(toy_policy(config, toy_dataset(config)).eval(), None)
-    actor = RealTimeActor(planner, timeout=3600)
+    network = toy_network(touch_dim=0, touch="", execution_horizon=1)
+    actor = RealTimeActor(LearnedPolicy(network, None), timeout=3600)
     actor.act(toy_observations(1)[0])
     with pytest.raises(KeyError):
         for _ in range(2):  # a plan from the first is needed in the second

@@ -7,6 +7,7 @@ import pytest
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.follower import WireFollower
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.episodes.recording import run
 from touchgoal.sim_envs.bead_maze import BeadMaze, add_bead_on_wire, add_wire
@@ -36,7 +37,7 @@ def follower(env):
     return WireFollower(env.config.control_hz)
 
 
-class FeelsSomethingElse:
+class FeelsSomethingElse(Actor):
     """The follower, with the forces of another run, or none."""
 
     def __init__(self, forces):

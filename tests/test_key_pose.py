@@ -12,7 +12,7 @@ from touchgoal.control import features as ft
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
 from touchgoal.policies.sight.average import KeyPoseAverage
-from touchgoal.policies.sight.estimates import FIXED, GROUPS, estimate_from, likeliest, seen_from
+from touchgoal.policies.sight.estimates import FIXED, GROUPS, estimate_from, likeliest, to_frame
 from touchgoal.policies.sight.frozen_images import ImageInputConfig
 from touchgoal.policies.sight.key_pose import face_any_way, key_poses, set_beside, true_pose
 from touchgoal.policies.sight.readout import CameraReadout, KeyPoseReadout, errors
@@ -159,9 +159,9 @@ def test_estimates_turn_into_the_hands_frame_as_scipy_turns_them() -> None:
     np.testing.assert_allclose(estimate[:, 3:6], turned[:, :, 2], atol=1e-5)
     torch.testing.assert_close(estimate_from(tcp, _turned_on(key, 1)), estimate)
     fixed = torch.tensor([FIXED]).expand(20, 7)
-    there = seen_from(fixed, estimate, tcp)
+    there = to_frame(fixed, estimate, tcp)
     torch.testing.assert_close(there, estimate_from(fixed, key))
-    torch.testing.assert_close(seen_from(tcp, there, fixed), estimate)
+    torch.testing.assert_close(to_frame(tcp, there, fixed), estimate)
 
 
 @pytest.mark.parametrize("first", [0.5, 0.51])
@@ -183,7 +183,7 @@ def test_the_average_of_a_moving_hand_steadies_and_follows_the_gripper() -> None
     off = []
     for tick, hand in enumerate(tcp[:, None]):
         if tick == 30:
-            average.go_on()
+            average.change_gripper()
         stage = int(tick >= 32)  # for half a second the fingers move
         assert average.gripper_moves == (tick in (30, 31))
         true = torch.cat([estimate_from(hand, key[None, :7]) for key in keys[stage : stage + 2]])

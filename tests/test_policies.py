@@ -1,6 +1,8 @@
 """Judging policies, shipped and one's own; what is recorded for them and what they learn from."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -266,6 +268,11 @@ def test_a_tick_embeds_like_its_episode_and_another_size_is_refused() -> None:
     np.testing.assert_allclose(alone, together[[4, 0]], atol=2e-2)
     with pytest.raises(UserError, match="camera images are 64 x 64, the policy reads 64 x 96"):
         embedder.embed_tick({ft.FRONT: images[0, :, :64], ft.WRIST: images[0]})
+
+
+def test_a_learned_policy_acts_and_deploys_without_a_simulator(tmp_path: Path) -> None:
+    program = Path(__file__).parent / "without_a_simulator.py"
+    subprocess.run([sys.executable, program, tmp_path], check=True, timeout=300)
 
 
 def test_the_shipped_maze_policy_knows_no_truth_of_the_simulator() -> None:

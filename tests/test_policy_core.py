@@ -296,7 +296,7 @@ def test_the_exact_flow_gives_the_gaussian_back(predicted: Literal["velocity", "
         )
 
     noise = torch.randn(4000, 4, 1, generator=torch_rng())
-    config = SamplerConfig("flow", predicted, num_inference_steps=200, clip=9)
+    config = SamplerConfig("flow", prediction_type=predicted, num_inference_steps=200, clip=9)
     samples = denoise(config, network, noise, torch_rng(1))
     assert samples.mean().item() == pytest.approx(MEAN, abs=0.01)
     assert samples.std().item() == pytest.approx(DEVIATION, rel=0.03)
@@ -313,7 +313,7 @@ def test_samplers_equal_diffusers(kind: Any, predicted: Any) -> None:
     theirs: Any = (DDPMScheduler if kind == "ddpm" else DDIMScheduler)(**options)
     steps = 100 if kind == "ddpm" else 10
     theirs.set_timesteps(steps)
-    config = SamplerConfig(kind, predicted, num_inference_steps=steps)
+    config = SamplerConfig(kind, prediction_type=predicted, num_inference_steps=steps)
     x = noise = torch.randn(3, 8, 2, generator=torch_rng())
     generator, more = torch_rng(1), {"use_clipped_model_output": True} if kind == "ddim" else {}
     for t in theirs.timesteps:

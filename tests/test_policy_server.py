@@ -12,7 +12,7 @@ import pytest
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.realtime import RealTimeActor
-from touchgoal.control.policy_server.policy import PolicyServer
+from touchgoal.control.policy_server.policy import ServedPolicy
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
 
@@ -54,7 +54,7 @@ def test_messages_are_openpis() -> None:
 def test_half_of_each_answer_is_executed() -> None:
     asked: list[dict] = []
     with serving(lambda m: asked.append(m) or {"actions": CHUNK + len(asked)}) as url:
-        policy = PolicyServer(f"{url}?image={ft.FRONT}", "pick it up")()
+        policy = ServedPolicy(f"{url}?image={ft.FRONT}", "pick it up")
         actions = [policy.act(TICK) for _ in range(5)]
     np.testing.assert_array_equal(actions, [*(CHUNK[:3] + 1), *(CHUNK[:2] + 2)])
     assert set(asked[0]) == {"image", "prompt"} and asked[0]["prompt"] == "pick it up"
@@ -72,7 +72,7 @@ def test_the_arm_holds_while_the_server_stalls() -> None:
         return {"actions": CHUNK}
 
     with serving(stall) as url:
-        actor = RealTimeActor(PolicyServer(url)(), timeout=0.01)
+        actor = RealTimeActor(ServedPolicy(url), timeout=0.01)
         actions = [actor.act(TICK) for _ in range(10)]
         held = actor.action_age
         actor.close()
@@ -94,7 +94,7 @@ def test_the_arm_holds_while_the_server_stalls() -> None:
 )
 def test_wrong_answers_are_refused(answer: Any, message: str) -> None:
     with serving(lambda _: answer) as url, pytest.raises(UserError, match=message):
-        PolicyServer(url)().act(TICK)
+        ServedPolicy(url).act(TICK)
 
 
 def test_commands_take_an_address(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

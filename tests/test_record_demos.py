@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.scripted import PickPlacePoses
-from touchgoal.control.interfaces import Actor, DriverError
+from touchgoal.control.interfaces import DriverError
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
 from touchgoal.control.safety.action_filter import ActionFilter
@@ -29,7 +29,7 @@ from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
 from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
 from touchgoal.control.teleoperation.teleoperator import Teleoperator
-from touchgoal.control.teleoperation.yielding_actor import YieldingActor
+from touchgoal.control.teleoperation.yielding import YieldingHand
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch import record_demos
 from touchgoal.launch.deploy import NOT_DONE
@@ -159,15 +159,12 @@ def test_the_hand_moves_as_asked_and_yields_to_what_it_presses_on() -> None:
 
 
 def test_a_policy_of_ones_own_task_yields_as_a_led_hand_does() -> None:
-    class Still(Actor):
-        def act(self, observation):
-            return np.append(np.zeros(7), 0.05)
-
     kinematics, q = Kinematics(FR3.arm, FR3.tool.tcp_offset), FR3.arm.home
-    hand = YieldingActor(Still(), ActionFilter(FR3, HZ), lambda: q)
+    hand, still = YieldingHand(ActionFilter(FR3, HZ), lambda: q), np.append(np.zeros(7), 0.05)
     hand.start({ft.WRENCH: np.ones(6)})
-    assert not hand.act({ft.WRENCH: 1.0 + np.array([0, 0, 2.9, 0, 0, 0.5])})[:7].any()
-    action = hand.act({ft.WRENCH: 1.0 + np.array([0, 0, 10.0, 0, 0, 0])})
+    light = {ft.WRENCH: 1.0 + np.array([0, 0, 2.9, 0, 0, 0.5])}
+    assert not hand.add_to(still, light)[:7].any()
+    action = hand.add_to(still, {ft.WRENCH: 1.0 + np.array([0, 0, 10.0, 0, 0, 0])})
     moved = kinematics.forward(q + action[:7])[0] - kinematics.forward(q)[0]
     np.testing.assert_allclose([*moved, action[7]], [0, 0, TICK * 4e-3 * 7, 0.05], atol=1e-5)
 

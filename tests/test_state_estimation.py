@@ -24,8 +24,7 @@ from touchgoal.policies.perception.state_estimation import (
     StateEstimator,
     load_pose_estimator,
 )
-from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed, sentence
-from touchgoal.policies.perception.target_words import Look as Shown
+from touchgoal.policies.perception.target_words import WORDS_WIDTH, Appearance, embed, sentence
 from touchgoal.policies.training.dagger import DaggerRoles
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import RefusedError, UserError
@@ -148,7 +147,7 @@ def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
 def test_a_sentence_fits_its_object_alone() -> None:
     rng = np.random.default_rng(0)
     looks = [
-        Shown(CATALOGUE[name], np.array(CATALOGUE[name].material.rgba[:3]), painted=False)
+        Appearance(CATALOGUE[name], np.array(CATALOGUE[name].material.rgba[:3]), painted=False)
         for name in ("toy_brick", "brick", "golf_ball")
     ]
     said = [{sentence(rng, a, [b for b in looks if b is not a]) for _ in range(60)} for a in looks]

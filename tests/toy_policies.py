@@ -1,5 +1,8 @@
 """Policies, windows and observations small enough to test with."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -46,6 +49,12 @@ def toy_policy(config: PolicyConfig, windows: SequenceDataset, seed: int = 0) ->
         touch, recorded.state, windows.joints, actions, recorded.wrench, windows.action_is_pad
     )
     return policy
+
+
+def toy_network(**changes: Any) -> PolicyNetwork:
+    """A network for inference; `changes` of the toy config."""
+    config = replace(TOY, **changes)
+    return toy_policy(config, toy_dataset(config)).eval()
 
 
 def toy_touch_embedder() -> TouchEmbedder:

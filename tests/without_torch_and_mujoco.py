@@ -1,27 +1,19 @@
 # ruff: noqa: E402
-"""Runs the scripted expert's plan and a user's policy with torch and MuJoCo blocked."""
+"""Runs the scripted expert's plan and a user's policy without torch, MuJoCo and Gymnasium."""
 
 import importlib
 import sys
 import tempfile
-from importlib.abc import MetaPathFinder
 from pathlib import Path
 
-BLOCKED = ("torch", "mujoco")
+from blocked_packages import SIMULATOR, Blocker
 
-
-class Blocker(MetaPathFinder):
-    def find_spec(self, fullname: str, path: object = None, target: object = None) -> None:
-        if fullname.split(".")[0] in BLOCKED:
-            raise ImportError(f"{fullname} is blocked")
-
-
-sys.meta_path.insert(0, Blocker())
+Blocker(*(BLOCKED := ("torch", *SIMULATOR)))
 
 from fake_cell import FakeCell, write_cell_file
 
 from touchgoal.control.cell.cell_file import read_cell_file
-from touchgoal.control.deployment.actors import load_user_policy, make_actor
+from touchgoal.control.deployment.actors import make_actor
 from touchgoal.control.deployment.control_loop import ControlLoop
 from touchgoal.control.deployment.session import Result, Session
 from touchgoal.control.interfaces import Actor
@@ -29,7 +21,6 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.launch import deploy
 from touchgoal.launch.support.command_line import parse
-from touchgoal.sim_envs.twin.cell_task import env_config_of
 
 CELL = """
 arm = "sim"
@@ -56,7 +47,7 @@ def run(folder: Path, policy: str, seconds: float) -> tuple[Result, FakeCell]:
     cell, fake = read_cell_file(write_cell_file(folder, text)), FakeCell()
     fake.gripper.follows = True
     safety = ActionFilter(FR3, 20)
-    loaded = load_user_policy(cell, env_config_of(cell))
+    loaded, _ = deploy.load_policy(cell)
 
     def actor(loop: ControlLoop) -> Actor:
         return make_actor(cell, loaded, safety, None, loop.commanded)
@@ -66,8 +57,8 @@ def run(folder: Path, policy: str, seconds: float) -> tuple[Result, FakeCell]:
     return session.run(), fake
 
 
-for path in (Path(__file__).parents[1] / "control" / "deployment").glob("*.py"):
-    importlib.import_module(f"touchgoal.control.deployment.{path.stem}")
+for path in (root := Path(__file__).parents[1]).glob("control/**/*.py"):
+    importlib.import_module(".".join(("touchgoal", *path.relative_to(root).with_suffix("").parts)))
 assert not set(BLOCKED) & set(sys.modules)
 assert parse(deploy.Config, ["sim"], prog="deploy", description="", envs=None).cell == Path("sim")
 with tempfile.TemporaryDirectory() as name:

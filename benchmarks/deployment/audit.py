@@ -4,6 +4,7 @@ A policy that does as well with another episode's touch does not use touch. The 
 of the same policy on the next wire or in the next scene; if it is shorter, its last tick is repeated.
 """
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -14,8 +15,9 @@ import numpy as np
 from benchmarks.deployment.trials import TABLE_HEAD, UNCHANGED, DeployedOptions, table_row
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
-from touchgoal.episodes.recording import Actor, EpisodeSpec
-from touchgoal.policies.by_name import PolicyMaker, prepare_policy
+from touchgoal.control.interfaces import Actor
+from touchgoal.episodes.recording import EpisodeSpec
+from touchgoal.policies.by_name import prepare_policy
 from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trial, trial_specs
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.runtime.parallel.parallel_map import parallel_map
@@ -29,7 +31,7 @@ class Config(DeployedOptions):
 
 
 @dataclass
-class _Watched:
+class _Watched(Actor):
     """A policy that keeps what it observed."""
 
     policy: Actor
@@ -41,7 +43,7 @@ class _Watched:
 
 
 @dataclass
-class _Replaced:
+class _Replaced(Actor):
     """A policy that observes some columns of another episode."""
 
     policy: Actor
@@ -78,7 +80,7 @@ def _inputs(env: TaskConfig) -> dict[str, tuple[str, ...]]:
 
 
 def _audit(
-    env: TaskConfig, maker: PolicyMaker, pair: tuple[EpisodeSpec, EpisodeSpec]
+    env: TaskConfig, maker: Callable[[Any], Actor], pair: tuple[EpisodeSpec, EpisodeSpec]
 ) -> dict[str, Trial]:
     """Run the second episode unchanged, then the first with each of its inputs taken from the second."""
     spec, other = pair

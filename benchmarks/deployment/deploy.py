@@ -26,7 +26,7 @@ from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.episodes.recording import EpisodeSpec
-from touchgoal.policies.by_name import prepare_policy, scripted
+from touchgoal.policies.by_name import prepare_policy
 from touchgoal.policies.evaluation.evaluate import run_trial, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
@@ -59,6 +59,7 @@ class Config(BenchmarkOptions):
     """Deployments side by side, in process and in lock-step."""
 
 
+_SCRIPTED = {"pick-place": "expert", "bead-maze": "follower"}  # by an arm
 EXAMPLES = {"pick-place": "sim.toml", "bead-maze": "sim_maze.toml"}
 _CELLS = Path(__file__).parents[2] / "control" / "cell" / "examples"
 
@@ -70,7 +71,7 @@ def run(config: Config) -> dict[str, Any]:
     for task in config.tasks:
         scenes = list(_scenes(task, config))
         for name in config.policies:
-            policy = scripted(task) if name == "scripted" else name
+            policy = _SCRIPTED[task] if name == "scripted" else name
             for arm in config.arms:
                 rows = _deploy_all(scenes, policy, arm, config)
                 lines += (own := _lines(rows))

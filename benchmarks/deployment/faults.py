@@ -34,12 +34,11 @@ from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop
 from touchgoal.control.deployment.realtime import RealTimeActor
 from touchgoal.control.deployment.session import Session
 from touchgoal.control.features import Observation
-from touchgoal.control.interfaces import Actor
+from touchgoal.control.interfaces import Actor, Planner
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.episodes.format.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.policies.network import PolicyConfig
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
@@ -275,27 +274,21 @@ class BrokenPolicy(Actor):
         return np.append(step, width)
 
 
-class HangingPlanner:
+class HangingPlanner(Planner):
     """A planner that turns the base and then never answers again, in the real planning thread."""
 
-    config = PolicyConfig(
-        touch_dim=0, touch="", observation_horizon=1, execution_horizon=8, prediction_horizon=16
-    )
-    history_ticks = 1
+    execution_horizon = 8
 
     def __init__(self, width: float, mark_broken: Callable[[], None]) -> None:
         self._width, self._mark_broken, self._plans = width, mark_broken, 0
 
-    def embed(self, observations: Sequence[Observation]) -> None:
-        """Do nothing: no work is done ahead."""
-
-    def plan(self, observations: Sequence[Observation]) -> np.ndarray:
+    def plan(self, observations: Sequence[Observation], /) -> np.ndarray:
         """Return three plans, then hang."""
         self._plans += 1
         if self._plans > 3:
             self._mark_broken()
             threading.Event().wait()
-        plan = np.zeros((self.config.prediction_horizon, ft.N_JOINTS + 1), np.float32)
+        plan = np.zeros((2 * self.execution_horizon, ft.N_JOINTS + 1), np.float32)
         plan[:, 0], plan[:, -1] = 0.02, self._width
         return plan
 

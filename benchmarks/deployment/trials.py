@@ -78,8 +78,8 @@ def _target(policy: str, task: TaskConfig) -> str | None:
     """Return a sentence with the object's name where others lie beside it; experts need none."""
     if not isinstance(task, PickPlaceConfig) or not task.distractors:
         return None
-    maker = choose_policy(policy, task)
-    reads = isinstance(maker, SavedPolicy) and maker.reads_words
+    maker, _ = choose_policy(policy, task)
+    reads = isinstance(maker, SavedPolicy) and maker.is_estimated
     return f"the {EPISODE_OBJECT}" if reads else None
 
 

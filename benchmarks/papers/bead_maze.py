@@ -1,7 +1,7 @@
 """Bead maze: success on unseen wires, and errors along recorded ones (TacBench T5, Sparsh Table 10).
 
 Policies of one recipe count as one group, its training seeds as repeats. All groups get the same
-wires and starts. The open-loop part is in `policies/evaluation/open_loop.py`.
+wires and starts. The open-loop part is in `open_loop.py`.
 """
 
 import tempfile
@@ -16,18 +16,19 @@ from jaxtyping import Float
 from pydantic import Field
 
 from benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.papers import open_loop
 from benchmarks.papers.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
 from touchgoal.encoders.backbones.sparsh import Method
 from touchgoal.encoders.pretrained import ENCODER_FORMAT
 from touchgoal.encoders.probes.bootstrap import percentile_interval
-from touchgoal.episodes.recording import Actor, EpisodeSpec, collect
+from touchgoal.episodes.recording import EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.by_name import follower
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
-from touchgoal.policies.evaluation import open_loop
 from touchgoal.policies.evaluation.evaluate import REFUSED, Trial, run_trials
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import DiffusionConfig
@@ -173,7 +174,7 @@ def _closed_loop(
     run_arm(f"follower, {HELD_OUT}", blind, [follower], other)
     for name, directories in arms.items():
         makers = [SavedPolicy(d) for d in directories]
-        env = makers[0].env_config(maze)
+        env = makers[0]().env_config(maze)
         run_arm(name, env, makers, jobs)
         run_arm(f"{name}, {HELD_OUT}", env, makers, other)
         if config.shuffled and checkpoint.load(directories[0]).config.touch_dim:
@@ -182,7 +183,7 @@ def _closed_loop(
     first = config.policies[0]
     for ticks in config.plan_ticks:
         late = SavedPolicy(first, plan_ticks=ticks)
-        run_arm(f"first policy, {ticks} ticks late", late.env_config(maze), [late], jobs)
+        run_arm(f"first policy, {ticks} ticks late", late().env_config(maze), [late], jobs)
     return results
 
 

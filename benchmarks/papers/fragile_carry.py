@@ -5,6 +5,7 @@ Every row gets the same rods, starts and tugs.
 
 import sys
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ import numpy as np
 from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
-from touchgoal.policies.by_name import PolicyMaker, prepare_policy
+from touchgoal.control.interfaces import Actor
+from touchgoal.policies.by_name import prepare_policy
 from touchgoal.policies.checkpoint import load
 from touchgoal.policies.evaluation.evaluate import Trial, run_trials, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
@@ -47,7 +49,7 @@ class Config(BenchmarkOptions):
 
 
 @dataclass(frozen=True)
-class OneForce:
+class OneForce(Actor):
     """Moves as the expert does, and squeezes every rod with one force (N)."""
 
     expert: FragileCarryExpert
@@ -65,7 +67,7 @@ def _one_force(env: FragileCarry) -> OneForce:
 def run(config: Config) -> dict[str, Any]:
     """Return success by row, with the trials."""
     blind = prepare_policy("expert", config.env)[1]
-    rows: dict[str, tuple[PolicyMaker, TaskConfig]] = {
+    rows: dict[str, tuple[Callable[[Any], Actor], TaskConfig]] = {
         "expert, which knows the slip": (FragileCarryExpert, blind),
         f"{_ONE_FORCE:g} N on every rod": (_one_force, blind),
     }

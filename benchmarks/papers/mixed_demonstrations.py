@@ -10,6 +10,7 @@ from jaxtyping import Float
 from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
 from benchmarks.papers.reward_quality.recording import Recorded
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
 from touchgoal.episodes.recording import EpisodeSpec, collect, missing_specs
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime import seeds
@@ -43,7 +44,7 @@ class MixedRoles:
         return expert, expert
 
 
-class MistakenExpert:
+class MistakenExpert(Actor):
     """The feedback expert with one mistake."""
 
     def __init__(self, env: PickPlace, mistake: Mistake) -> None:

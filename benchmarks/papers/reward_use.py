@@ -247,7 +247,7 @@ def _train(
 def _try(policy: Path, trials: int, workers: int) -> list[Trial]:
     copy_parts(policy, {ESTIMATOR: _ESTIMATOR})
     maker = SavedPolicy(policy)
-    env = maker.env_config(_TASK)
+    env = maker().env_config(_TASK)
     specs = trial_specs(env, trials, seeds.POLICY_TEST.start)
     return list(run_trials(env, maker, specs, workers))
 
@@ -289,7 +289,7 @@ def _checkpoints(data: _Demonstrations, judge: Judge, config: Config) -> list[di
 
 def _judge_rollouts(policy: Path, judge: Judge, config: Config, folder: Path) -> dict[str, float]:
     """Record episodes in which a checkpoint acts; return their mean last costs."""
-    size = SavedPolicy(policy).env_config(_TASK).camera_size
+    size = SavedPolicy(policy)().env_config(_TASK).camera_size
     env = replace(_TASK, cameras=("front", "wrist"), camera_size=size)
     specs = trial_specs(env, config.rollouts, seeds.POLICY_TEST.start + config.trials)
     collect(folder, env, specs, config.workers, _Acts(policy))

@@ -112,7 +112,7 @@ def _published(config: Config) -> list[Stage]:
     if config.large_repeats == 0:
         return []
     generator = torch.Generator().manual_seed(0)
-    sampler = SamplerConfig("ddim", "epsilon", num_inference_steps=16)
+    sampler = SamplerConfig("ddim", prediction_type="epsilon", num_inference_steps=16)
     head = Diffusion(DiffusionConfig(PRESETS["published"], sampler), 8, 8, 1550).eval()
     condition = torch.zeros(1, 1550)
     size = sum(p.numel() for p in head.parameters()) / 1e6

@@ -2,17 +2,16 @@
 
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
-from touchgoal.control.interfaces import Actor
+from touchgoal.control.interfaces import Actor, Planner
 from touchgoal.control.motion.tracker import ServoLag
+from touchgoal.control.teleoperation.yielding import YieldingHand
 from touchgoal.runtime.errors import UserError
 
 _FIRST_PLAN_TIMEOUT = 20.0  # s for the first plan; it warms everything up
@@ -33,55 +32,37 @@ class _Request:
     at: float  # monotonic s of the newest
 
 
-@runtime_checkable
-class Horizons(Protocol):
-    """Horizons of a policy, in ticks."""
-
-    @property
-    def observation_horizon(self) -> int: ...  # noqa: D102
-    @property
-    def execution_horizon(self) -> int: ...  # noqa: D102
-    @property
-    def control_hz(self) -> int: ...  # noqa: D102
-
-
-@runtime_checkable
-class ChunkPlanner(Protocol):
-    """A policy that plans; see `policies/acting.py` and `user_policy.py`."""
-
-    @property
-    def config(self) -> Horizons: ...  # noqa: D102
-    @property
-    def history_ticks(self) -> int: ...  # noqa: D102
-    def embed(self, observations: Sequence[Observation], /) -> None: ...  # noqa: D102
-    def plan(self, observations: Sequence[Observation], /) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
-
-
 class RealTimeActor(Actor):
     """Actor that answers at once from the newest plan, while a thread makes the next one.
 
     A plan is used from the tick after its observation's. It is requested one tick early, so that it
     has a whole tick to be made and actions do not depend on the machine's speed. Action k belongs
     to the tick k after the observation, so a late plan makes no jump; if plans run out the arm
-    stands still. A plan no longer than its executed part is requested only when needed. An arm that
-    follows at once reacts sooner than the servo that the policy was trained on: `lag` restores the
-    servo's delay. Joint changes that `lag` still holds back count as commanded.
+    stands still. A plan no longer than its executed part is requested only when needed.
     """
 
     def __init__(
-        self, planner: ChunkPlanner, timeout: float | None = None, lag: ServoLag | None = None
+        self,
+        planner: Planner,
+        timeout: float | None = None,
+        lag: ServoLag | None = None,
+        hand: YieldingHand | None = None,
     ) -> None:
         """Begin an episode of the planner; `close` ends the thread.
 
-        `timeout` is the time to wait for a late plan, s; None: half a tick.
+        Args:
+            timeout: time to wait for a late plan, s; None: half a tick.
+            lag: delay of the servo that the policy was trained on; an arm that follows at once reacts
+                sooner. Joint changes that it still holds back count as commanded.
+            hand: yields to what it presses on; not with `lag`.
         """
-        self._planner, self._config = planner, planner.config
+        self._planner, self._hand = planner, hand
         # s from an observation to its plan, without the first plan
         self.latencies: list[float] = []
         self._lag = lag
         self._before: np.ndarray | None = None  # joints (rad) wanted at the last tick
         self.failure: BaseException | None = None  # ended the planning thread; `act` raises it
-        half = 0.5 / planner.config.control_hz
+        half = 0.5 / planner.control_hz
         self._timeout = half if timeout is None else timeout
         self._tick = self._embedded = -1
         self._history: list[Observation] = []
@@ -95,6 +76,8 @@ class RealTimeActor(Actor):
 
     def start(self, observation: Observation) -> None:
         """Make the first plan, which warms everything up, at rest; UserError if none in 20 s."""
+        if self._hand is not None:
+            self._hand.start(observation)
         with self._condition:
             self._history = [observation] * self._planner.history_ticks
             self._request = _Request(0, self._history, time.monotonic())
@@ -107,12 +90,14 @@ class RealTimeActor(Actor):
                 raise self.failure
 
     def act(self, observation: Observation) -> Float[np.ndarray, "8"]:
-        """Return the action for this tick, delayed by `lag`."""
-        self.done = bool(getattr(self._planner, "done", False))  # of users' own policies
+        """Return the action for this tick, as `lag` and `hand` change it."""
+        self.done = self._planner.done
+        if self._hand is not None:
+            return self._hand.add_to(self._answer(observation), observation)
         if self._lag is None:
             return self._answer(observation)
         q = observation[ft.COMMAND][: ft.N_JOINTS] + self._lag.remaining
-        velocity = (q - (q if self._before is None else self._before)) * self._config.control_hz
+        velocity = (q - (q if self._before is None else self._before)) * self._planner.control_hz
         self._before = q
         wanted = np.concatenate([q, velocity]).astype(np.float32)
         action = self._answer({**observation, ft.COMMAND: wanted})
@@ -156,7 +141,7 @@ class RealTimeActor(Actor):
             self._width = float(action[ft.N_JOINTS])
             self.action_age = 0.0
             return action
-        self.action_age += 1 / self._config.control_hz
+        self.action_age += 1 / self._planner.control_hz
         return np.append(np.zeros(ft.N_JOINTS), self._width).astype(np.float32)
 
     def _no_request(self) -> bool:
@@ -176,7 +161,7 @@ class RealTimeActor(Actor):
 
     def _take(self, request: _Request, actions: Float32[np.ndarray, "h 8"]) -> None:
         """Store a finished plan for `act`."""
-        horizon = self._config.execution_horizon
+        horizon = self._planner.execution_horizon
         with self._condition:
             end = request.tick + horizon
             if self._plan is None:
@@ -189,7 +174,7 @@ class RealTimeActor(Actor):
 
     def _next_work(self) -> _Request | list[Observation] | None:
         """Wait for a plan's request, or observations of the next plan to embed; None at the end."""
-        ahead = self._config.observation_horizon - 1
+        ahead = self._planner.observation_horizon - 1
 
         def to_embed() -> bool:
             return self._embedded < self._tick and self._due(ahead)

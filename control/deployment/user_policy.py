@@ -10,58 +10,40 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
-from touchgoal.control.policy_server.policy import PolicyServer
+from touchgoal.control.interfaces import Planner, Policy
+from touchgoal.control.policy_server.policy import ServedPolicy
 from touchgoal.runtime.errors import UserError
 
-Config = TypeVar("Config")
 
+class UserPolicy(Planner):
+    """A user's policy at work; on an arm its single tick is a plan, so that the loop never waits for it."""
 
-@runtime_checkable
-class Policy(Protocol):
-    """A policy: two methods."""
+    def __init__(self, name: str, given: Any = None, env: Any = None) -> None:
+        """Make the policy; in an environment its episode begins, else call `reset` before `act`.
 
-    def reset(self) -> None:
-        """Begin an episode."""
+        UserError: no such class, it lacks a method, or it takes arguments.
 
-    def act(self, observation: Observation) -> np.ndarray:
-        """Return the action of the next tick: joint change (rad, one a joint), gripper's width (m).
-
-        Keys and units of the observation: `control/features.py`.
+        Args:
+            name: `module:Class` or `file.py:Class`, for messages, too.
+            given: the class or an object of it; None: it is imported by its name.
+            env: environment that it acts in; None: an FR3.
         """
-        ...
-
-
-@dataclass(frozen=True)
-class _EveryTick:
-    """Horizons of a policy that answers every tick."""
-
-    observation_horizon: int = 1
-    execution_horizon: int = 1
-    control_hz: int = ft.CONTROL_HZ
-
-
-class CheckedPolicy:
-    """A user's policy at work: a wrong action is a UserError with the policy's name.
-
-    For the control loop it also plans, one tick at a time, so that the loop never waits for a slow one.
-    """
-
-    config = _EveryTick()
-    history_ticks = 1
-
-    def __init__(self, policy: Policy, name: str, n_joints: int = ft.N_JOINTS) -> None:
-        self._policy, self._name, self._n_joints = policy, name, n_joints
+        self._name, self._policy = name, _make(name, _import(name) if given is None else given)
+        self._n_joints = ft.N_JOINTS
+        if env is not None:
+            self._n_joints = env.n_joints
+            self.reset()
 
     def reset(self) -> None:
         """Begin an episode."""
@@ -70,6 +52,7 @@ class CheckedPolicy:
     def act(self, observation: Observation) -> Float32[np.ndarray, " a"]:
         """Return the next action; UserError if not finite or not of the robot's shape."""
         answer = self._policy.act(dict(observation))
+        self.done = bool(getattr(self._policy, "done", False))
         wanted = f"{self._n_joints} joint changes (rad) and the gripper's width (m)"
         try:
             action = np.asarray(answer, np.float32)
@@ -85,83 +68,61 @@ class CheckedPolicy:
             )
         return action
 
-    @property
-    def done(self) -> bool:
-        """Whether the policy has ended the episode: by an attribute `done`, if it has one."""
-        return bool(getattr(self._policy, "done", False))
-
-    def embed(self, observations: Sequence[Observation]) -> None:
-        """Do nothing: no work is done ahead."""
-
-    def plan(self, observations: Sequence[Observation]) -> Float32[np.ndarray, "1 a"]:
+    def plan(self, observations: Sequence[Observation], /) -> Float32[np.ndarray, "1 a"]:
         """Return the action for the next tick as a plan."""
         return self.act(observations[-1])[None]
 
-
-@dataclass(frozen=True)
-class UserPolicy:
-    """Maker of a user's policy for one episode, in any process."""
-
-    name: str  # `module:Class` or `file.py:Class`
-    given: Any = None  # the class or an object of it; None: it is imported by its name
-
-    def __call__(self, env: Any = None) -> CheckedPolicy:
-        """Make the policy of one episode, for the environment's robot, or an FR3 without one."""
-        n_joints = ft.N_JOINTS if env is None else env.n_joints
-        policy = CheckedPolicy(self._make(), self.name, n_joints)
-        policy.reset()
-        return policy
-
-    def env_config(self, config: Config) -> Config:
-        """Return the environment's options as the policy's own `env_config` changes them.
-
-        UserError if there is no such class, it lacks a method, or it takes arguments.
-        """
-        change = getattr(self._make(), "env_config", None)
+    def env_config(self, config: Any, /) -> Any:
+        """Return the environment's options as the policy's own `env_config` changes them."""
+        change = getattr(self._policy, "env_config", None)
         return config if change is None else change(config)
 
-    def _make(self) -> Policy:
-        found = self._import() if self.given is None else self.given
-        for method in ("reset", "act"):
-            if not callable(getattr(found, method, None)):
-                raise UserError(
-                    f"{self.name} has no method {method}: a policy has reset() and act(observation)"
-                )
-        if not isinstance(found, type):
-            return found
-        try:
-            inspect.signature(found).bind()
-        except TypeError as error:
-            raise UserError(
-                f"{self.name}: {error}; the class is made without arguments, so give them defaults"
-            ) from None
-        except ValueError:  # no signature, as of a class from C
-            pass
-        return found()
 
-    def _import(self) -> Any:
-        place, _, attribute = self.name.rpartition(":")
-        module = _import_file(Path(place)) if place.endswith(".py") else _import(place)
-        found = getattr(module, attribute, None)
-        if found is None:
-            close = get_close_matches(attribute, vars(module), 1)
-            guess = f": did you mean {close[0]}?" if close else ""
-            raise UserError(f"{place} has no {attribute}{guess}")
-        return found
+def find_user_policy(
+    name: str, instruction: str = ""
+) -> Callable[..., UserPolicy | ServedPolicy] | None:
+    """Return what makes the policy `module:Class`, `file.py:Class` or `ws://host:port` for an episode.
 
-
-def find_user_policy(name: str, instruction: str = "") -> UserPolicy | PolicyServer | None:
-    """Return the policy `module:Class`, `file.py:Class` or `ws://host:port`; None for other names.
-
+    It takes the environment, or nothing for an arm, in any process. None for other names.
     `instruction` is what a server gets where no environment has one.
     """
     if name.startswith(("ws://", "wss://")):
-        return PolicyServer(name, instruction)
+        return partial(ServedPolicy, name, instruction)
     _, colon, attribute = name.rpartition(":")
-    return UserPolicy(name) if colon and attribute.isidentifier() else None
+    return partial(UserPolicy, name, None) if colon and attribute.isidentifier() else None
+
+
+def _make(name: str, found: Any) -> Policy:
+    for method in ("reset", "act"):
+        if not callable(getattr(found, method, None)):
+            raise UserError(
+                f"{name} has no method {method}: a policy has reset() and act(observation)"
+            )
+    if not isinstance(found, type):
+        return found
+    try:
+        inspect.signature(found).bind()
+    except TypeError as error:
+        raise UserError(
+            f"{name}: {error}; the class is made without arguments, so give them defaults"
+        ) from None
+    except ValueError:  # no signature, as of a class from C
+        pass
+    return found()
 
 
 def _import(name: str) -> Any:
+    place, _, attribute = name.rpartition(":")
+    module = _import_file(Path(place)) if place.endswith(".py") else _import_module(place)
+    found = getattr(module, attribute, None)
+    if found is None:
+        close = get_close_matches(attribute, vars(module), 1)
+        guess = f": did you mean {close[0]}?" if close else ""
+        raise UserError(f"{place} has no {attribute}{guess}")
+    return found
+
+
+def _import_module(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -9,9 +9,8 @@ instruction.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
-from typing import Any, TypeVar
+from dataclasses import replace
+from typing import Any
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -19,50 +18,27 @@ from jaxtyping import Float32
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Planner
 from touchgoal.runtime.errors import UserError, install_extra
 
-Config = TypeVar("Config")
 
-
-@dataclass(frozen=True)
-class PolicyServer:
-    """Maker of a served policy for one episode, in any process."""
-
-    address: str
-    instruction: str = ""  # where no environment gives one
-
-    def __call__(self, env: Any = None) -> "ServedPolicy":
-        """Connect for the environment's robot, or an FR3 without one; UserError if none answers."""
-        if env is None:
-            return ServedPolicy(self.address, self.instruction, ft.N_JOINTS)
-        return ServedPolicy(self.address, env.instruction(), env.n_joints)
-
-    def env_config(self, config: Config) -> Config:
-        """Return the environment's options with the images that the address names, if it names any."""
-        if not (sent := set(_names(self.address).values())):
-            return config
-        cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in ft.CAMERAS if key in sent)
-        tactile = not sent.isdisjoint(ft.TACTILE)
-        return replace(config, cameras=cameras, tactile=tactile)  # pyright: ignore
-
-
-class ServedPolicy:
+class ServedPolicy(Planner):
     """A served policy at work; a wrong answer is a UserError with the server's address."""
 
-    history_ticks = 1
+    def __init__(self, address: str, instruction: str = "", env: Any = None) -> None:
+        """Connect for the environment's robot, or an FR3 without one; UserError if no server answers.
 
-    def __init__(self, address: str, prompt: str, n_joints: int) -> None:
-        """Connect; UserError if no policy server answers."""
+        `instruction` is sent where no environment gives one.
+        """
         try:
             from touchgoal.control.policy_server.connection import Connection
         except ImportError:
             raise UserError(f"a policy server needs {install_extra('server')}") from None
-        self._url, self._names, self._prompt = address.partition("?")[0], _names(address), prompt
-        self._width, self._connection = n_joints + 1, Connection(self._url)
-        # ticks; the executed ones are known from the first answer
-        self.config: Any = SimpleNamespace(
-            observation_horizon=1, execution_horizon=1, control_hz=ft.CONTROL_HZ
-        )
+        self._url, _, names = address.partition("?")
+        self._names = dict(parse_qsl(names))  # our keys by the server's names; none: all are sent
+        self._prompt = instruction if env is None else env.instruction()
+        self._width = 1 + (ft.N_JOINTS if env is None else env.n_joints)
+        self._connection = Connection(self._url)
         self.reset()
 
     def reset(self) -> None:
@@ -72,13 +48,10 @@ class ServedPolicy:
     def act(self, observation: Observation) -> Float32[np.ndarray, " a"]:
         """Return the action for the next tick."""
         if not self._todo:
-            self._todo = list(self.plan([observation])[: self.config.execution_horizon])
+            self._todo = list(self.plan([observation])[: self.execution_horizon])
         return self._todo.pop(0)
 
-    def embed(self, observations: Sequence[Observation]) -> None:
-        """Do nothing: no work is done ahead."""
-
-    def plan(self, observations: Sequence[Observation]) -> Float32[np.ndarray, "h a"]:
+    def plan(self, observations: Sequence[Observation], /) -> Float32[np.ndarray, "h a"]:
         """Return the server's actions, the first for the latest observation."""
         answer = self._connection.infer(self._message(observations[-1]))
         try:
@@ -92,7 +65,7 @@ class ServedPolicy:
                 f"{self._url} gave actions that are {wrong}; it must give (ticks, {self._width}): "
                 f"{self._width - 1} joint changes (rad) and the gripper's width (m)"
             )
-        self.config.execution_horizon = (ticks + 1) // 2
+        self.execution_horizon = (ticks + 1) // 2
         return actions
 
     def _message(self, observation: Observation) -> dict[str, Any]:
@@ -102,7 +75,9 @@ class ServedPolicy:
             raise UserError(f"--policy {self._url}: there is no {min(missing)}, only {keys}")
         return {name: observation[key] for name, key in names.items()} | {"prompt": self._prompt}
 
-
-def _names(address: str) -> dict[str, str]:
-    """Return our keys by the server's names; none if all are sent."""
-    return dict(parse_qsl(address.partition("?")[2]))
+    def env_config(self, config: Any, /) -> Any:
+        """Return the environment's options with the images that the address names, if it names any."""
+        if not (sent := set(self._names.values())):
+            return config
+        cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in ft.CAMERAS if key in sent)
+        return replace(config, cameras=cameras, tactile=not sent.isdisjoint(ft.TACTILE))

@@ -1,17 +1,19 @@
 """Success rate of a policy over many episodes of a task, judged by the simulator."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from gymnasium.spaces import Box
 
 from touchgoal.control import features as ft
+from touchgoal.control.interfaces import Actor, Policy
 from touchgoal.control.tactile.light_gain import LightWatch
 from touchgoal.episodes.recording import EpisodeSpec, run
-from touchgoal.policies.by_name import AnyPolicy, PolicyMaker, prepare_policy
+from touchgoal.policies.by_name import prepare_policy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import RefusedError, UserError
@@ -81,7 +83,7 @@ class Evaluation:
 
 
 def evaluate(
-    policy: AnyPolicy,
+    policy: str | Path | Policy | type,
     task: str | TaskConfig = "pick-place",
     *,
     episodes: int = 20,
@@ -120,11 +122,14 @@ def trial_specs(config: TaskConfig, count: int, seed: int) -> list[EpisodeSpec]:
 
 
 def run_trials(
-    config: TaskConfig, policy: PolicyMaker, specs: Sequence[EpisodeSpec], workers: Workers
+    config: TaskConfig,
+    policy: Callable[[Any], Actor],
+    specs: Sequence[EpisodeSpec],
+    workers: Workers,
 ) -> Iterator[Trial]:
     """Run a policy in each episode; yield the trials in order as they end.
 
-    With one worker all runs in this process; for several the policy's maker must pickle.
+    With one worker all runs in this process; for several `policy`, which makes one for an environment, must pickle.
     """
     if workers == 1:
         for spec in track(specs, "trials", "episode"):
@@ -134,7 +139,7 @@ def run_trials(
         yield from track(trials, "trials", "episode", total=len(specs))
 
 
-def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Trial:
+def run_trial(config: TaskConfig, policy: Callable[[Any], Actor], spec: EpisodeSpec) -> Trial:
     """Run one episode."""
     env = make_env(config)
     try:

@@ -1,7 +1,7 @@
 """Record of an evaluation: each trial as it ends, the table, films of three episodes."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.tick_parts import parts_of
 from touchgoal.episodes.film import write_film
 from touchgoal.episodes.recording import EpisodeSpec, OnTick, record_with_film
-from touchgoal.policies.by_name import PolicyMaker
 from touchgoal.policies.evaluation.evaluate import REFUSED, Evaluation, Trial
 from touchgoal.policies.evaluation.table import table, worst_first
 from touchgoal.runtime.json_file import write_json
@@ -58,7 +58,7 @@ def film_trials(
     task: TaskConfig,
     specs: Sequence[EpisodeSpec],
     trials: Sequence[Trial],
-    policy: PolicyMaker,
+    policy: Callable[[Any], Actor],
     workers: int,
     rerun: str | None = None,
 ) -> None:
@@ -92,7 +92,7 @@ def _chosen(specs: Sequence[EpisodeSpec], trials: Sequence[Trial]) -> dict[str, 
 
 def _film(
     task: TaskConfig,
-    policy: PolicyMaker,
+    policy: Callable[[Any], Actor],
     out: Path | None,
     job: tuple[str, EpisodeSpec],
     on_tick: OnTick | None = None,

@@ -1,4 +1,4 @@
-"""Novelty of what a policy feels: how little of it the training's variation explains."""
+"""Novelty of touch embeddings: the part that the training's variation does not explain."""
 
 import math
 from collections.abc import Sequence
@@ -15,9 +15,9 @@ _LEAST = round(1 / _FALSE_ALARMS) - 1  # fewest held-out episodes that bound tha
 class NoveltyDetector(nn.Module):
     """Distance of embeddings from the training's main principal components; 1 is the limit.
 
-    Jackson and Mudholkar's Q statistic (Technometrics 21, 1979). Of touch it tells a sensor that
-    sits elsewhere, swapped colours, or one finger without contact; the distance to the nearest
-    known embedding tells less. What the training shows in another place stays unnoticed.
+    Jackson and Mudholkar's Q statistic (Technometrics 21, 1979). It detects a displaced
+    sensor, swapped colours, or one finger without contact, better than the distance to the nearest
+    known embedding. Familiar touch at an unusual time stays unnoticed.
     """
 
     def __init__(self, dim: int) -> None:

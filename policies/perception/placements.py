@@ -12,7 +12,7 @@ from torch import Tensor
 
 from touchgoal.control import features as ft
 from touchgoal.control.motion.rotations import fingers_down
-from touchgoal.policies.perception.target_words import COLOURS, Look, sentence
+from touchgoal.policies.perception.target_words import COLOURS, Appearance, sentence
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import PickPlaceConfig
@@ -27,7 +27,7 @@ _COLOUR_NOISE = 0.04  # standard deviation of a painted colour, of [0, 1]
 
 @dataclass(frozen=True)
 class Variety:
-    """Shares of the placements, or of the objects, that are not as usual."""
+    """Shares of varied placements, or objects."""
 
     painted: float = 0.5  # objects of another colour than their kind's
     surroundings: float = 0.7  # placements with another camera pose and light
@@ -39,7 +39,7 @@ class Variety:
 class Placements:
     """Starts of n episodes, each with up to k objects on the table, any of which may be the target.
 
-    An object that is not there, or that no sentence tells from the others, has sentence -1.
+    A missing object, or one that no sentence distinguishes from the others, has sentence -1.
     """
 
     pictures: dict[str, UInt8[Tensor, "n h w 3"]]  # camera images by column
@@ -77,7 +77,7 @@ def render_placements(
         partial(_render_scene, config, placements_each, variety), seeds, workers
     ) as some:
         for row in chain.from_iterable(track(some, "rendering", "scene", total=scenes)):
-            for key in keys:  # nothing else is large: one copy of these must do
+            for key in keys:  # the only large arrays, so no second copy
                 pictures[key][len(rows)] = torch.from_numpy(row.pop(key))
             rows.append(row)
     sentences = sorted({words for row in rows for words in row["words"] if words})
@@ -125,7 +125,7 @@ def _render_placement(env: PickPlace, rng: np.random.Generator, variety: Variety
             rgb = np.clip(rng.normal(COLOURS[name], _COLOUR_NOISE), 0, 1)
         env.model.geom(body.name).rgba[:] = *rgb, float(body in shown)
         if body in shown:
-            looks.append(Look(body.kind, rgb, paint))
+            looks.append(Appearance(body.kind, rgb, paint))
     shown.sort(key=env.bodies.index)
     observation, _ = env.rearrange(_draw_hand(env, rng, order[:count], variety))
     row: dict[str, Any] = dict(observation)

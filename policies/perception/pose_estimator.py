@@ -1,7 +1,7 @@
 """Pose estimator: a network from an episode's first camera images to object and goal poses.
 
-It looks twice: a coarse map scores where the named object and the goal are; a crop around each, at
-full resolution, gives their poses. Keypoints of the whole image show how the camera stands.
+It works in two stages: a coarse map locates the named object and the goal; a crop around each, at full
+resolution, gives their poses. Keypoints of the whole image give the camera's pose.
 """
 
 from dataclasses import dataclass, replace
@@ -83,7 +83,7 @@ class PoseEstimator(nn.Module):
         return self.look(lit, words, self.scene(lit, tcp)).start
 
     def scene(self, lit: Pictures, tcp: Float[Tensor, "b 7"]) -> Float[Tensor, "b s"]:
-        """Return how the camera stands, by the whole image and the hand in it."""
+        """Encode the camera's pose from the whole image and the hand's pose."""
         known = [self.tcp_normalizer(tcp)]
         for (key, _), scene in zip(self.config.crops, self.scenes, strict=True):
             halved = lit[key][:, ::2, ::2]

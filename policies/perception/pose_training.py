@@ -38,8 +38,8 @@ def train_pose_estimator(
 ) -> None:
     """Train the pose estimator; writes what `trainer.fit` does."""
     there = torch.arange(placements.start.shape[1]) < placements.objects[:, None]
-    # Rounded: what inverse kinematics leaves of the hand's tilt is no information, and would be taken
-    # for some when a real hand is tilted by a thousandth.
+    # Rounded: the tilt that inverse kinematics leaves is no information, and the network would react
+    # to a real hand that is tilted by a thousandth.
     estimator.tcp_normalizer.fit_mean_std(placements.tcp.round(decimals=4))
     estimator.start_normalizer.fit_mean_std(placements.start[there])
     embedded = embed(placements.sentences) if placements.sentences else torch.empty(0, WORDS_WIDTH)
@@ -127,9 +127,9 @@ def _words(
     target: Int64[Tensor, " b"],
     noise: BatchNoise,
 ) -> tuple[Float[Tensor, "b d"], Bool[Tensor, " b"]]:
-    """Return the embedded sentences of the targets, and whether each is singled out.
+    """Return the embedded sentences of the targets, and whether each identifies its target.
 
-    Half of those that are alone get none.
+    Half of the targets that stand alone get no sentence.
     """
     sentences, alone = placements.sentence[rows, target], placements.objects[rows] == 1
     silent = (sentences < 0) | (alone & (noise.rand((len(rows),)) < 0.5))
@@ -172,7 +172,7 @@ def fit_sure(
     """Return `PoseEstimatorConfig.sure`, and the shares of good and of bad estimates refused by it.
 
     Each number refuses a third of the 2 % of good estimates that may be refused; a bad one is off by
-    2 cm or 20 degrees. Only what sentences single out is looked at, or stands alone.
+    2 cm or 20 degrees. Only objects that a sentence identifies, or that stand alone, count.
     """
     sure, good = [], []
     for rows, target, words in _targets(placements):

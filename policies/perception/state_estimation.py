@@ -1,6 +1,6 @@
 """State estimation in pick-and-place: contact from touch, and the poses at the start from a camera.
 
-A policy is trained on the simulator's truth and acts on the estimates.
+A policy is trained on ground truth and acts on the estimates.
 """
 
 from collections.abc import Mapping
@@ -27,8 +27,8 @@ ESTIMATOR_FORMAT = WeightsFormat(
 _FARTHEST = 4.0  # standard deviations of the hand's start in training
 _OBJECT = 5  # numbers of `features.TRUTH_START` on the object
 _ASKED = ("where the object is", "where the disc is", "how the object is turned")
-# Of looks after the first, m: two that agree within the first distance and are the second one away
-# from what is known say that the object was moved. A hand nearer than the third hides too much.
+# m. The object has moved if two later estimates agree within the first distance and lie the second
+# one away from the known place. A hand nearer than the third distance hides too much.
 _AGREE, _MOVED, _NEAREST = 0.006, 0.014, 0.04
 ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 
@@ -36,7 +36,7 @@ ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 class StateEstimator:
     """Estimator of the columns `ESTIMATED`; it follows one episode after the other.
 
-    Until the first touch it looks again at every tick, and follows an object that was moved.
+    Until the first touch it estimates at every tick, and follows an object that is moved.
 
     Attributes:
         cameras: columns of the camera images that it reads.
@@ -61,8 +61,8 @@ class StateEstimator:
     ) -> dict[str, Float32[np.ndarray, " n"]]:
         """Return the contact of each pad (1 or 0), and the poses at the start.
 
-        Observations come in order. An episode's first one is untouched and has all of the table in
-        view. RefusedError: it does not show object and goal well enough.
+        Observations come in order. The first one of an episode is without contact and shows the whole
+        table. RefusedError: it does not show object and goal well enough.
         """
         if self._first is not first:
             self._begin(first)
@@ -75,7 +75,7 @@ class StateEstimator:
 
     @torch.inference_mode()
     def _begin(self, first: Mapping[str, np.ndarray]) -> None:
-        """Begin an episode: estimate its poses, take its untouched gels."""
+        """Begin an episode: estimate its poses, store its untouched gels."""
         tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
         self._check_hand(tcp)
         pictures = self._pictures(first)
@@ -93,9 +93,9 @@ class StateEstimator:
 
     @torch.inference_mode()
     def _look_again(self, observation: Mapping[str, np.ndarray]) -> None:
-        """Replace the object's pose if two looks agree that it moved.
+        """Replace the object's pose if two estimates agree that it moved.
 
-        How the camera stands is known from the first images, in which nothing moves.
+        The camera's pose is taken from the first images, in which nothing moves.
         """
         look = self.pose_estimator.look(self._pictures(observation), self._words, self._scene)
         if any(sure < least for sure, least in zip(look.sureness, self._least, strict=True)):
@@ -107,7 +107,7 @@ class StateEstimator:
             self._start = np.concatenate([(now + before)[:_OBJECT] / 2, self._start[_OBJECT:]])
 
     def _check_hand(self, tcp: Float32[Tensor, "1 7"]) -> None:
-        """Refuse a start from where the hand was not in training: it would pass for a moved camera."""
+        """Refuse a start outside the training's hand poses, which would look like a moved camera."""
         away = self.pose_estimator.tcp_normalizer(tcp)[0, :3]
         if away.abs().max() > _FARTHEST:
             usual = self.pose_estimator.tcp_normalizer.inverse(torch.zeros(7))[:3].tolist()

@@ -38,8 +38,8 @@ _DISTINCT = 0.25  # distance in RGB beyond which two colours are not confused
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """An object as a person would name it."""
+class Appearance:
+    """Kind and colour of an object, by which a person names it."""
 
     kind: ObjectKind
     rgb: RGB
@@ -51,7 +51,9 @@ class Look:
         return min(COLOURS, key=lambda name: _distance(COLOURS[name], self.rgb))
 
 
-def sentence(rng: np.random.Generator, target: Look, others: Sequence[Look]) -> str | None:
+def sentence(
+    rng: np.random.Generator, target: Appearance, others: Sequence[Appearance]
+) -> str | None:
     """Draw a sentence that fits the target and none of the others; None if colour and shape do not
     tell them apart."""
     fitting = _phrases(rng, target, others)
@@ -65,7 +67,7 @@ def sentence(rng: np.random.Generator, target: Look, others: Sequence[Look]) -> 
 
 
 def _phrases(
-    rng: np.random.Generator, target: Look, others: Sequence[Look]
+    rng: np.random.Generator, target: Appearance, others: Sequence[Appearance]
 ) -> list[tuple[str, float]]:
     """Return phrases, each with its weight in the draw."""
     kind, noun = target.kind, str(rng.choice(NOUNS[target.kind.shape]))

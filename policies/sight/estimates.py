@@ -1,12 +1,12 @@
 """Estimates of hand poses that can be averaged, over cameras and over time.
 
-An estimate (10) is a place (m), the approach (the hand's z axis), and the cosine and sine of twice and of
-four times the turn about the approach. A parallel gripper turned by half a turn grasps alike: twice the turn
-is the same for both (Morrison et al. 2018). A box can be grasped across either pair of faces, a quarter turn
-apart: where the means of twice the turn vanish, those of four times tell both. The mean of the turns
-themselves would lie between, across the corners.
+An estimate (10) is a position (m), the approach (the hand's z axis), and the cosine and sine of twice and of
+four times the rotation about the approach. A parallel gripper that is rotated by half a turn grasps the same:
+twice the angle is equal for both (Morrison et al. 2018). A box can be grasped across either pair of faces, a
+quarter turn apart: there the means of twice the angle vanish, and those of four times the angle remain. A mean
+of the angles themselves would lie between them, across the corners.
 
-Estimates are seen from a hand's frame: that of the present hand, or `FIXED`, where the base is and with
+Estimates are expressed in a frame: that of the present hand, or `FIXED`, which lies at the base with the
 fingers down.
 """
 
@@ -26,12 +26,12 @@ GROUPS = 2, 1, 3, 2, 2
 SCALES = 0.05, 0.05, 0.3, 0.6, 1.2  # errors that weigh alike: m, m, rad, and rad of the multiples
 FIXED = 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0  # a pose: position (m), quaternion (wxyz)
 _DEGREES = 180  # candidate turns, a degree apart: half a turn in all
-# by how much of a sure estimate the present turn is preferred: no change from one of two equals
+# bonus of the present rotation, as a share of a certain estimate: of two equals the nearer one stays
 _STAY = 0.1
 
 
 def estimate_from(frame: Float[Tensor, "b 7"], pose: Float[Tensor, "b 7"]) -> Float[Tensor, "b 10"]:
-    """Return the estimate that a pose of the base frame is, seen from `frame`; both are in the base frame."""
+    """Express a pose as an estimate in `frame`; both are poses in the base frame."""
     axes = _axes(frame)
     there = axes.mT @ _axes(pose)
     turn = _reference(there[:, :, 2]).mT @ there
@@ -39,10 +39,10 @@ def estimate_from(frame: Float[Tensor, "b 7"], pose: Float[Tensor, "b 7"]) -> Fl
     return torch.cat([place, there[:, :, 2], _multiples(turn)], 1)
 
 
-def seen_from(
+def to_frame(
     frame: Float[Tensor, "b 7"], estimate: Float[Tensor, "b 10"], before: Float[Tensor, "b 7"]
 ) -> Float[Tensor, "b 10"]:
-    """Return estimates, seen from `before`, as seen from `frame`."""
+    """Express estimates, given in the frame `before`, in `frame`."""
     to, place = _axes(frame).mT @ _axes(before), estimate[:, :3, None]
     place = to @ place + _axes(frame).mT @ (before - frame)[:, :3, None]
     z = F.normalize(estimate[:, 3:6], dim=1)
@@ -56,7 +56,7 @@ def seen_from(
 
 
 def likeliest(estimate: Float[Tensor, "b 10"]) -> Float[Tensor, "b 9"]:
-    """Return the likeliest pose: place and two columns of the rotation, turned by at most a quarter turn."""
+    """Return the likeliest pose: position and two columns of the rotation, at most a quarter turn away."""
     turns, columns = _turns()
     weight = estimate[:, 6:] + torch.tensor([_STAY, 0.0, 0.0, 0.0]).to(estimate)
     turn = turns.to(estimate)[(weight @ columns.to(estimate)).argmax(1)]

@@ -1,4 +1,4 @@
-"""Frozen image encoder for a policy's cameras: feature maps, of which it learns keypoints."""
+"""Frozen image encoder for a policy's cameras: feature maps, from which keypoints are learned."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ from touchgoal.policies.perception.keypoints import keypoints
 from touchgoal.runtime.errors import UserError
 
 MAP_CHANNELS = 40  # of `EfficientNetLite0.fine_map`
-_SHARPNESS = 10.0  # of the softmax: keypoints all begin in the middle, and soon leave it
+_SHARPNESS = 10.0  # of the softmax; all keypoints begin in the middle and soon leave it
 _BATCH = 4  # images; the activations of more leave the cache
 
 
 @dataclass(frozen=True)
 class ImageInputConfig:
-    """Cameras that a policy reads at every plan, and what it learns of their feature maps."""
+    """Cameras that a policy reads at every plan, and the network that finds keypoints in their maps."""
 
     cameras: tuple[str, ...]  # columns such as observation.images.front
     size: tuple[int, int]  # rows and columns of their images, px
-    hidden: int = 32  # channels of the convolutions that the keypoints are found by
+    hidden: int = 32  # channels of the convolutions that find the keypoints
     keypoints: int = 32  # of each image
 
     @property
@@ -82,9 +82,9 @@ def _network() -> EfficientNetLite0:
 
 
 class ImageReadout(nn.Module):
-    """Network from the feature maps of one camera to the places of keypoints, and nothing else.
+    """Network from the feature maps of one camera to the positions of keypoints, without features.
 
-    By features of the keypoints it would recognise each recorded scene.
+    With features it would recognise each recorded scene.
     """
 
     def __init__(self, config: ImageInputConfig) -> None:
@@ -112,5 +112,5 @@ class ImageReadout(nn.Module):
         self.std.copy_(sample.std((0, 2, 3)).clamp(min=1e-3)[:, None, None])
 
     def forward(self, maps: Float[Tensor, "b c y x"]) -> Float[Tensor, "b p"]:
-        """Return the place of each keypoint."""
+        """Return the position of each keypoint."""
         return keypoints(_SHARPNESS * self.layers((maps - self.mean) / self.std), maps[:, :0])

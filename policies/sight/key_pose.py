@@ -1,9 +1,9 @@
 """The next key pose: where the hand will be when the gripper next opens or closes, or the task ends.
 
-With it comes whether the gripper is closed afterwards: without that, the end of a task looks like the
-place to grasp. The recordings hold both (keyframes: James and Davison 2022), and camera images show it. Taught it, a
-policy learns where things are; trained on the actions alone, it memorises the recordings. The key pose
-after it is predicted as well: later the hand and the object in it may hide that place.
+Whether the gripper is closed afterwards is predicted with it, because the end of a task would otherwise be
+taken for a place to grasp. Recordings provide both as labels (keyframes: James and Davison 2022). A policy
+that is trained to predict them learns where objects are; one trained on the actions alone memorises the
+recordings. The key pose after the next one is predicted too, because the hand and its object may hide it later.
 """
 
 import math
@@ -21,14 +21,14 @@ KEY_POSE_DIM = 14  # of `features`
 _POSE = 9  # position, and two columns of the rotation matrix
 HOLD_SECONDS = 0.5  # s in which the fingers move
 _LEVELS = 1e-3  # m between the least and the greatest commanded width: less is one width
-_POSITION, _ROTATION = 0.05, 0.3  # m and rad that weigh alike
-_NEAR = 0.02  # m; the second input grows fast below it, and hardly above
-_NOISE = 0.003  # m and, of the rotation's columns, 1; on what the policy reads in training
+_POSITION, _ROTATION = 0.05, 0.3  # m and rad that weigh the same
+_NEAR = 0.02  # m; scale of the second input, which saturates above it
+_NOISE = 0.003  # m (and as much of the rotation's columns) of noise on the input in training
 _CLOSE = 0.1  # m from the key pose within which errors are corrected
 _BESIDE = 0.02, 0.02, 0.01, 0.2  # m along the hand's axes, rad about its z axis
 _BACK = 10  # ticks
 _REACHED = 0.02  # m
-_AT = math.sqrt(3) * _NOISE  # m; the training's noise: the head cannot tell it from there
+_AT = math.sqrt(3) * _NOISE  # m; the training's noise, within which the head cannot see a distance
 _STILL = 0.0002  # m per tick
 
 
@@ -38,17 +38,18 @@ def key_poses(
     lengths: Sequence[int],
     hold: int,
 ) -> Float32[np.ndarray, "n 3 8"]:
-    """Return for every tick the TCP pose at the last change of the commanded width, and at the next ones.
+    """Return for every tick the TCP pose at the last change of the commanded width and at the next two.
 
-    First that at the last change, and 1; before the first change the present one, and 0. Then that at the
-    next change, or at the end, and 1 if the gripper is closed after it, else 0; and the same of the change
-    that follows. An episode that ends open has let go: then the last change stays the next, for the hand
-    above what it left looks like the hand above what it will grasp.
+    Row 0 is the pose at the last change and 1, or the present pose and 0 before the first change. Row 1 is
+    the pose at the next change, or at the end, and 1 if the gripper is closed after it, else 0. Row 2 is the
+    same for the change after that. An episode that ends with an open gripper has released its object: then
+    the last change stays the next one, because a hand above a placed object cannot be told from a hand
+    above an object to grasp.
 
     Args:
         lengths: ticks of each episode, one after the other.
-        hold: ticks for which a key pose stays the next after the change: until the fingers have moved,
-            nothing shows that it was commanded.
+        hold: ticks for which a key pose stays the next one after the change: the change is not visible
+            until the fingers have moved.
     """
     closed = widths < (widths.min() + widths.max()) / 2
     ends = np.cumsum(lengths) - 1
@@ -69,25 +70,26 @@ def key_poses(
 
 
 def true_pose(tcp: Float[Tensor, "b 7"], key: Float[Tensor, "b 3 8"]) -> Float[Tensor, "b 11"]:
-    """Return what sight tells if it is perfect: the next key pose in the hand's frame, and what is around it.
+    """Return the policy's input from true key poses: the next one in the hand's frame.
 
-    Position and two columns of the rotation; 1 if the gripper closes there; see `nearness` of the last one.
+    It holds position (m), two columns of the rotation, 1 if the gripper is closed afterwards, and the
+    `nearness` of the last change.
     """
     found = likeliest(estimate_from(tcp, key[:, 1, :7]))
     return torch.cat([found, key[:, 1, 7:], key[:, 0, 7:] * nearness(tcp, key[:, 0, :3])], 1)
 
 
 def nearness(tcp: Float[Tensor, "b 7"], left: Float[Tensor, "b 3"]) -> Float[Tensor, "b 1"]:
-    """Return how near the hand is to where the gripper last changed: from 1, there, to 0, far away.
+    """Return how near the hand is to where the gripper last changed, from 1 (there) to 0 (far away).
 
-    It shows whether a grasp is still to be left, where the way to the next key pose would be along the table.
+    Near a grasp the hand must first rise: the straight way to the next key pose leads along the table.
     """
     away = (tcp[:, :3] - left).norm(dim=1, keepdim=True)
     return (-(away / _POSITION).square() / 2).exp()
 
 
 def features(pose: Float[Tensor, "b 11"], noise: BatchNoise | None = None) -> Float[Tensor, "b 14"]:
-    """Return a policy's input for `true_pose`, or what is seen of it, with the training's noise if given."""
+    """Return the network input for a pose as from `true_pose`, with the training's noise if given."""
     if noise is not None:
         turned = _NOISE / _POSITION * _ROTATION
         scale = torch.tensor([_NOISE] * 3 + [turned] * 6 + [0, 0])
@@ -103,10 +105,10 @@ def gripper_plan(
     width: float,
     widths: tuple[float, ...],
 ) -> Float[Tensor, "b h"]:
-    """Return the planned widths, as sight allows: `width` is kept until the hand rests at the next key pose.
+    """Return the planned widths, but keep `width` until the hand rests at the next key pose.
 
-    Then the gripper changes at the latest: the head alone, which sees the pose with noise, often does not
-    plan to, even where recordings change within the plan more often than not.
+    There the gripper changes even if the head does not plan it: the head is trained with noise on the pose
+    and often misses the change.
 
     Args:
         pose: as from `true_pose`.
@@ -124,9 +126,9 @@ def gripper_plan(
 def face_any_way(
     pose: Float[Tensor, "b 11"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
 ) -> tuple[Float[Tensor, "b 11"], Float[Tensor, "b h 8"]]:
-    """Return `true_pose` and plans ("body_twist") as where all faces another way about the hand's approach.
+    """Rotate `true_pose` and plans ("body_twist") by a random angle about the hand's approach.
 
-    Few recordings go the same way as seen from the hand; how they go does not depend on it.
+    Recordings cover few directions in the hand's frame, and the motion does not depend on the direction.
     """
     axes = _about_z(2 * math.pi * noise.rand((len(pose), 1)).to(pose))
     x, y = pose[:, 3:_POSE].split(3, 1)
@@ -140,10 +142,10 @@ def face_any_way(
 def set_beside(
     pose: Float[Tensor, "b 11"], chunk: Float[Tensor, "b h 8"], noise: BatchNoise
 ) -> tuple[Float[Tensor, "b 11"], Float[Tensor, "b h 8"]]:
-    """Return half of the near key poses and plans ("body_twist") as from a hand beside the recorded one.
+    """Displace the hand of half of the windows near a key pose; plans ("body_twist") lead it back.
 
-    The plans lead it back: recordings hardly show how errors are corrected. Where the gripper changes
-    nothing is moved, so that it changes only in its place; and far away nothing need be corrected.
+    Recordings contain few corrections of errors. Windows in which the gripper changes are left as they
+    are, so that it changes only at its place; so are those far away, which need no correction.
     """
     drawn = noise.randn((len(pose), 4)).to(pose) * torch.tensor(_BESIDE).to(pose)
     widths = chunk[..., -1]
@@ -162,7 +164,7 @@ def set_beside(
 
 
 def _about_z(turn: Float[Tensor, "b 1"]) -> Float[Tensor, "b 3 3"]:
-    """Return matrices by which row vectors, times them, are turned about z (rad)."""
+    """Return matrices that rotate row vectors about z by these angles (rad)."""
     cos, sin, zero = turn.cos(), turn.sin(), torch.zeros_like(turn)
     rows = torch.cat([cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1], 1)
     return rows.unflatten(1, (3, 3))

@@ -15,22 +15,22 @@ from touchgoal.policies.sight.estimates import (
     GROUPS,
     SCALES,
     estimate_from,
-    seen_from,
+    to_frame,
 )
 from touchgoal.policies.sight.frozen_images import ImageInputConfig, ImageReadout
 
-SEEN = 2  # key poses: the next one, and the one that follows
-_PLACE, _PLACE_GROUPS = 3, 2  # of an estimate: its first numbers, and their groups
-_SMALL = 0.1  # of `SCALES`, below which an error counts squared
-_OPEN = 0.9  # of the range of widths, from the least
-_LEAST, _MOST = -5.0, 3.0  # logarithm of a camera's expected error
+COUNT = 2  # key poses: the next one, and the one after it
+_PLACE, _PLACE_GROUPS = 3, 2  # an estimate's numbers that are a position, and their groups
+_SMALL = 0.1  # error relative to `SCALES` below which it counts squared
+_OPEN = 0.9  # share of the range of widths above which the gripper is open
+_LEAST, _MOST = -5.0, 3.0  # bounds of the logarithm of an expected error
 
 
 class CameraReadout(nn.Module):
-    """Estimates by one camera, seen from its frame, the errors that it expects, and what the gripper does.
+    """Network from one camera's maps to key pose estimates in its frame, expected errors and gripper state.
 
-    Place and turn have separate networks. A camera that cannot see a turn memorises it for each recording;
-    with shared keypoints that would make places wrong, too.
+    Position and rotation have separate networks. A camera that cannot see a rotation memorises it for each
+    recording; with shared keypoints its positions would be wrong, too.
     """
 
     def __init__(self, config: ImageInputConfig) -> None:
@@ -39,11 +39,11 @@ class CameraReadout(nn.Module):
         self.normalizer = Normalizer((_PLACE,))
         width = ImageReadout.width(config) + 2
         turns, turn_groups = ESTIMATE_DIM - _PLACE, len(GROUPS) - _PLACE_GROUPS
-        self.places = readout(width, 128, SEEN * (_PLACE + _PLACE_GROUPS + 1))
-        self.turns = readout(width, 128, SEEN * (turns + turn_groups))
+        self.places = readout(width, 128, COUNT * (_PLACE + _PLACE_GROUPS + 1))
+        self.turns = readout(width, 128, COUNT * (turns + turn_groups))
 
     def fit(self, maps: Float16[Tensor, "n c y x"], places: Float[Tensor, "m 3"]) -> None:
-        """Fit the normalizers to training data: places seen from the camera's frame, m."""
+        """Fit the normalizers to training data; `places` are positions in the camera's frame, m."""
         self.place_images.fit(maps)
         self.turn_images.fit(maps)
         self.normalizer.fit_mean_std(places)
@@ -51,12 +51,12 @@ class CameraReadout(nn.Module):
     def forward(
         self, maps: Float[Tensor, "b c y x"], state: Float[Tensor, "b 2"]
     ) -> tuple[Float[Tensor, "b 2 10"], Float[Tensor, "b 2 5"], Float[Tensor, "b 2"]]:
-        """Return estimates, logarithms of the errors expected, and logits of the gripper's being closed."""
-        seen = torch.cat([self.place_images(maps), state], 1)
-        found = self.places(seen).unflatten(1, (SEEN, -1))
+        """Return estimates, logarithms of the expected errors, and logits of a closed gripper."""
+        points = torch.cat([self.place_images(maps), state], 1)
+        found = self.places(points).unflatten(1, (COUNT, -1))
         place, place_error, closed = found.split([_PLACE, _PLACE_GROUPS, 1], 2)
-        seen = torch.cat([self.turn_images(maps), state], 1)
-        found = self.turns(seen).unflatten(1, (SEEN, -1))
+        points = torch.cat([self.turn_images(maps), state], 1)
+        found = self.turns(points).unflatten(1, (COUNT, -1))
         turn, turn_error = found.split(ESTIMATE_DIM - _PLACE, 2)
         estimate = torch.cat([self.normalizer.inverse(place), turn], 2)
         expected = torch.cat([place_error, turn_error], 2).clamp(_LEAST, _MOST)
@@ -66,9 +66,9 @@ class CameraReadout(nn.Module):
 class KeyPoseReadout(nn.Module):
     """Network from the cameras' feature maps to estimates of the next key pose and of the one after it.
 
-    Each camera gives estimates and the errors that it expects: one on the hand seen from the hand, another
-    from a fixed frame; and whether the gripper is closed after each. The estimates are averaged, the surer
-    ones with more weight.
+    Each camera predicts estimates, their expected errors, and whether the gripper is closed after each. A
+    camera on the hand estimates in the hand's frame, any other in a fixed frame. The estimates are averaged,
+    weighted by their expected errors.
     """
 
     def __init__(self, config: ImageInputConfig) -> None:
@@ -78,7 +78,7 @@ class KeyPoseReadout(nn.Module):
         self.height_normalizer = Normalizer((1,))
         self.open_width = nn.Buffer(torch.zeros(1))  # m; at less the gripper is closed, or closes
         # added to the logarithms of the expected errors
-        self.calibration = nn.Buffer(torch.zeros(len(config.cameras), SEEN, len(GROUPS)))
+        self.calibration = nn.Buffer(torch.zeros(len(config.cameras), COUNT, len(GROUPS)))
 
     def fit(
         self,
@@ -102,9 +102,9 @@ class KeyPoseReadout(nn.Module):
         width: Float[Tensor, "b 1"],
         key: Float[Tensor, "b 2 8"],
     ) -> None:
-        """Scale the expected errors to those made on episodes that were not trained on.
+        """Scale the expected errors to the actual ones on validation episodes.
 
-        A network expects errors as small as those on what it has learned by heart (Guo et al. 2017).
+        A network that overfits expects too small errors (Guo et al. 2017).
         """
         estimates, expected, _ = self.estimates(maps, tcp, width)
         made = errors(estimates, self._true(tcp, key)) * (-expected).exp()
@@ -116,21 +116,22 @@ class KeyPoseReadout(nn.Module):
         tcp: Float[Tensor, "b 7"],
         width: Float[Tensor, "b 1"],
     ) -> tuple[Float[Tensor, "b 2 11"], Float[Tensor, "b 2 5"]]:
-        """Return the average of the cameras' estimates, seen from the hand.
+        """Return the average of the cameras' estimates, in the hand's frame, and the weights of `GROUPS`.
 
-        Then the probability that the gripper is closed after it; and how much each of `GROUPS` weighs beside
-        other estimates.
+        The last number of an estimate is the probability that the gripper is closed afterwards.
         """
         estimates, expected, closed = self.estimates(maps, tcp, width)
         frames = self._frames(tcp)
-        hand = tcp.repeat_interleave(SEEN, 0)
-        seen = [
-            seen_from(hand, estimates[:, k].flatten(0, 1), frame.repeat_interleave(SEEN, 0))
+        hand = tcp.repeat_interleave(COUNT, 0)
+        estimated = [
+            to_frame(hand, estimates[:, k].flatten(0, 1), frame.repeat_interleave(COUNT, 0))
             for k, frame in enumerate(frames)
         ]
         weights = (-2 * expected).exp()  # inverse squares of the expected errors
         shares = repeated(weights / weights.sum(1, keepdim=True))
-        average = (shares * torch.stack(seen, 1).unflatten(0, (-1, SEEN)).transpose(1, 2)).sum(1)
+        average = (
+            shares * torch.stack(estimated, 1).unflatten(0, (-1, COUNT)).transpose(1, 2)
+        ).sum(1)
         return torch.cat([average, closed.mean(1).sigmoid()[..., None]], 2), weights.sum(1)
 
     def loss(
@@ -140,9 +141,9 @@ class KeyPoseReadout(nn.Module):
         width: Float[Tensor, "b 1"],
         key: Float[Tensor, "b 2 8"],
     ) -> Float[Tensor, ""]:
-        """Return the loss of the estimates and of the errors that the cameras expect.
+        """Return the loss of the estimates and of their expected errors.
 
-        The expected errors do not weigh the estimates (Seitzer et al. 2022): hard images are learned, too.
+        The expected errors do not weight the estimates (Seitzer et al. 2022), so that hard images are learned.
         """
         estimates, expected, closed = self.estimates(maps, tcp, width)
         made = errors(estimates, self._true(tcp, key))
@@ -158,8 +159,8 @@ class KeyPoseReadout(nn.Module):
         width: Float[Tensor, "b 1"],
         key: Float[Tensor, "b 2 8"],
     ) -> Float[Tensor, "b 2"]:
-        """Return how far the estimates are off, m."""
-        off = self(maps, tcp, width)[0][..., :-1] - _seen(tcp, key)
+        """Return the position errors of the estimates, m."""
+        off = self(maps, tcp, width)[0][..., :-1] - _estimates_in(tcp, key)
         return off[..., :_PLACE].norm(dim=-1)
 
     def estimates(
@@ -168,10 +169,7 @@ class KeyPoseReadout(nn.Module):
         tcp: Float[Tensor, "b 7"],
         width: Float[Tensor, "b 1"],
     ) -> tuple[Float[Tensor, "b k 2 10"], Float[Tensor, "b k 2 5"], Float[Tensor, "b k 2"]]:
-        """Return each camera's estimates, seen from its frame, and the logarithms of its expected errors.
-
-        And the logits of the gripper's being closed after them.
-        """
+        """Return each camera's estimates in its frame, log expected errors, and logits of a closed gripper."""
         height, is_open = self.height_normalizer(tcp[:, 2:3]), (width >= self.open_width).float()
         state = torch.cat([height, is_open], 1)  # the width itself depends on how an object is held
         found = [camera(maps[:, k], state) for k, camera in enumerate(self.cameras)]
@@ -179,30 +177,32 @@ class KeyPoseReadout(nn.Module):
         return estimates, expected + self.calibration, closed
 
     def _frames(self, tcp: Float[Tensor, "b 7"]) -> list[Float[Tensor, "b 7"]]:
-        """Return the frame that each camera's estimates are seen from."""
+        """Return the frame of each camera's estimates."""
         fixed = torch.tensor(FIXED).to(tcp).expand_as(tcp)
         return [tcp if on_hand else fixed for on_hand in self.on_hand]
 
     def _true(
         self, tcp: Float[Tensor, "b 7"], key: Float[Tensor, "b 2 8"]
     ) -> Float[Tensor, "b k 2 10"]:
-        """Return what each camera should estimate."""
-        return torch.stack([_seen(frame, key) for frame in self._frames(tcp)], 1)
+        """Return the true estimates in each camera's frame."""
+        return torch.stack([_estimates_in(frame, key) for frame in self._frames(tcp)], 1)
 
 
-def _seen(frame: Float[Tensor, "b 7"], key: Float[Tensor, "b 2 8"]) -> Float[Tensor, "b 2 10"]:
-    """Return the estimates that true key poses are, seen from `frame`."""
-    return torch.stack([estimate_from(frame, key[:, n, :7]) for n in range(SEEN)], 1)
+def _estimates_in(
+    frame: Float[Tensor, "b 7"], key: Float[Tensor, "b 2 8"]
+) -> Float[Tensor, "b 2 10"]:
+    """Express true key poses as estimates in `frame`."""
+    return torch.stack([estimate_from(frame, key[:, n, :7]) for n in range(COUNT)], 1)
 
 
 def errors(
     estimates: Float[Tensor, "b k 2 10"], true: Float[Tensor, "b k 2 10"]
 ) -> Float[Tensor, "b k 2 5"]:
-    """Return how far each of `GROUPS` is off, relative to `SCALES`."""
+    """Return the error of each of `GROUPS`, relative to `SCALES`."""
     off = (estimates - true).split(GROUPS, -1)
     return torch.stack([x.norm(dim=-1) / s for x, s in zip(off, SCALES, strict=True)], -1)
 
 
 def repeated(groups: Float[Tensor, "... 5"]) -> Float[Tensor, "... 10"]:
-    """Return a number of each of `GROUPS` for each of its numbers."""
+    """Repeat the number of each of `GROUPS` for all its components."""
     return groups.repeat_interleave(torch.tensor(GROUPS).to(groups.device), -1)

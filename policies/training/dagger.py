@@ -1,4 +1,4 @@
-"""Demonstrations by experts that can be asked in any state, also while a policy acts (DAgger)."""
+"""Demonstrations by an expert that labels any state, also while a policy acts (DAgger)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.recording import Actor, EpisodeSpec
+from touchgoal.control.interfaces import Actor
+from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.policies.acting import LearnedPolicy
-from touchgoal.policies.by_name import choose_policy, env_config_for
+from touchgoal.policies.by_name import choose_policy
 from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
@@ -27,27 +28,26 @@ _START_ERROR = np.array([0.003, 0.003, 0.0015, 0.03, 0.03, 0.0015, 0.0015])
 class DaggerRoles:
     """Actor and expert of a recording, see `Roles` in `episodes/recording.py`."""
 
-    # makes the policy that acts while the expert's actions are recorded (DAgger, Ross et al. 2011),
-    # on true states with noise if it has a state estimator. None: the expert itself acts
+    # makes the policy that acts while the expert's actions are recorded (DAgger, Ross et al. 2011);
+    # a policy with a state estimator gets true states with noise. None: the expert itself acts
     policy: Callable[[Any], Actor] | None = None
 
     def __call__(self, env: FrankaTactileEnv, spec: EpisodeSpec) -> tuple[Actor, Actor]:
         """Return the actor, and the expert whose actions are recorded."""
         expert = FeedbackExpert(env) if isinstance(env, PickPlace) else make_expert(env)
-        if self.policy is None:
+        if (policy := self.policy) is None:
             return expert, expert
-        if isinstance(self.policy, SavedPolicy) and isinstance(env, PickPlace):
-            network = self.policy.network()
-            if network.config.estimated:
-                return LearnedPolicy(network, None, _NoisyTruth(env), env.plan_ticks), expert
-        actor = self.policy(env)
-        if isinstance(actor, LearnedPolicy):  # what is novel is what it must learn
+        if isinstance(policy, SavedPolicy) and isinstance(env, PickPlace) and policy.is_estimated:
+            truth = _NoisyTruth(env)
+            return LearnedPolicy(policy.network(), None, truth, env.plan_ticks), expert
+        actor = policy(env)
+        if isinstance(actor, LearnedPolicy):  # it must learn from novel states
             actor.refuses_novelty = False
         return actor, expert
 
 
 def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> DaggerRoles:
-    """Return the roles of a recording by an expert that is asked at every tick, also while it acts.
+    """Return the roles of a recording by an expert that gives an action at every tick.
 
     UserError: the policy or the expert cannot act in the task.
     """
@@ -57,9 +57,8 @@ def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> Dagger
         raise UserError("--env.release needs the planned expert: leave out --feedback and --policy")
     if policy is None or policy == "expert":
         return DaggerRoles()
-    maker = choose_policy(policy, task)
-    needed = env_config_for(maker, task)
-    if isinstance(maker, SavedPolicy) and maker.network().config.estimated:
+    maker, needed = choose_policy(policy, task)
+    if isinstance(maker, SavedPolicy) and maker.is_estimated:
         return DaggerRoles(maker)
     missing = [f"the {name} camera" for name in needed.cameras if name not in task.cameras]
     missing += ["the fingertips"] * (needed.tactile and not task.tactile)
@@ -71,7 +70,7 @@ def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> Dagger
 
 
 class _NoisyTruth:
-    """The simulator's truth, with an error that stays for an episode as a pose estimator's does."""
+    """Ground truth with an error that is constant within an episode, as a pose estimator's is."""
 
     def __init__(self, env: PickPlace) -> None:
         self._env = env

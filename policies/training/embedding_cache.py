@@ -22,7 +22,7 @@ class Embedder(Protocol):
     """Frozen encoder of an episode's ticks."""
 
     name: str  # identifies the embeddings
-    shape: tuple[int, ...]  # of one tick's
+    shape: tuple[int, ...]  # shape of one tick's embedding
 
     def embed(self, episodes: EpisodeSet, i: int) -> np.ndarray:
         """Embed all ticks of an episode."""

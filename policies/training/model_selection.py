@@ -39,7 +39,7 @@ def select(
 def score(policy: Path, env: TaskConfig, trials: int, workers: Workers) -> Score:
     """Return how well the policy in a folder does in a number of trials that choose a snapshot."""
     maker = SavedPolicy(policy)
-    env = maker.env_config(env)
+    env = maker().env_config(env)
     start = seeds.MODEL_SELECTION.first(trials, "--trials")
     result = Evaluation(tuple(run_trials(env, maker, trial_specs(env, trials, start), workers)))
     return result.rate.successes / trials, result.progress

@@ -1,7 +1,7 @@
 """Weights of training windows by the progress that they make, where demonstrations differ in quality.
 
 Reward-aligned behaviour cloning (RA-BC) of SARM (Chen et al. 2025, arXiv:2509.25358, eq. 8 and 9),
-as lerobot computes it: what makes progress counts in full, what loses it not at all.
+as lerobot computes it: windows with progress count in full, windows that lose progress not at all.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ def progress_weights(
 ) -> Float32[np.ndarray, " n"]:
     """Return a weight in [0, 1] for every frame of some episodes, one after the other.
 
-    It is that of the progress in the next `ahead` frames, or until the end of the episode.
+    The weight follows from the progress in the next `ahead` frames, or until the episode's end.
     """
     later = [np.minimum(np.arange(len(p)) + ahead, len(p) - 1) for p in progress]
     gain = np.concatenate([p[to] - p for p, to in zip(progress, later, strict=True)])

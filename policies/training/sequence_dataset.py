@@ -34,7 +34,7 @@ class Recordings:
     lengths: tuple[int, ...]  # ticks of each episode
     pictures: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
     wrench: Float32[Tensor, "n 12"] | None = None  # on both pads (N, Nm, pad frames), if trained on
-    maps: Float16[Tensor, "n k c y x"] | None = None  # of the cameras, see `ImageEmbedder`
+    maps: Float16[Tensor, "n k c y x"] | None = None  # camera feature maps, see `ImageEmbedder`
     key_pose: Float32[Tensor, "n 3 8"] | None = None  # the last and the next two, beside `maps`
 
 

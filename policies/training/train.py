@@ -22,6 +22,8 @@ from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNet
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
+_BETAS, _WEIGHT_DECAY = (0.95, 0.999), 1e-6  # of AdamW, as in diffusion_policy
+_VALIDATION_WINDOWS = 1024  # evenly spaced, for the losses
 
 
 def train(
@@ -32,6 +34,7 @@ def train(
     out_dir: Path,
     options: TrainerOptions,
     recipe: dict[str, Any],
+    warmup_steps: int = 500,
 ) -> PolicyNetwork:
     """Train a policy; the moving average of its weights is the result.
 
@@ -44,6 +47,7 @@ def train(
         validation: windows of other episodes.
         out_dir: folder of a new run, or of the one to resume.
         recipe: JSON-able provenance of the episodes, written beside the weights.
+        warmup_steps: in which the learning rate rises; a tenth of the training if that is shorter.
     """
     recorded = windows.recorded
     widths = recorded.actions[:, -1].unique().tolist()
@@ -66,8 +70,8 @@ def train(
         if last or len(history) % config.snapshot_epochs == 0:
             folders.append(out_dir / SNAPSHOTS / f"epoch-{len(history):04d}")
         if folders and averaged.key_pose:
-            batch = _validation_batch(averaged, validation, config)
-            averaged.calibrate_sight(_observed(batch), batch["key_pose"])
+            batch = _validation_batch(averaged, validation)
+            averaged.calibrate_key_poses(_observed(batch), batch["key_pose"])
         for folder in folders:
             on_first_process(partial(checkpoint.save, averaged, folder, provenance | known))
 
@@ -81,16 +85,17 @@ def train(
             config.epochs,
             config.batch_size,
             config.lr,
-            config.weight_decay,
-            betas=config.betas,
-            max_warmup_steps=config.warmup,
+            _WEIGHT_DECAY,
+            betas=_BETAS,
+            max_warmup_steps=warmup_steps,
         ),
         identity={
             "train": asdict(config),
+            "warmup_steps": warmup_steps,
             "policy": asdict(policy),
             "data": [_checksum(windows), _checksum(validation)],
         },
-        evaluate=lambda: _validate(averaged, validation, config, options.seed),
+        evaluate=lambda: _validate(averaged, validation, options.seed),
         progress=_progress,
         after_step=lambda: average.update_parameters(network),
         after_epoch=save_snapshot,
@@ -148,11 +153,9 @@ def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, 
     }
 
 
-def _validation_batch(
-    policy: PolicyNetwork, windows: SequenceDataset, config: TrainConfig
-) -> dict[str, Any]:
+def _validation_batch(policy: PolicyNetwork, windows: SequenceDataset) -> dict[str, Any]:
     """Return windows from all over the validation episodes, on the policy's device."""
-    n = min(config.validation_windows, len(windows))
+    n = min(_VALIDATION_WINDOWS, len(windows))
     rows = torch.linspace(0, len(windows) - 1, n).long()
     device = policy.action_normalizer.scale.device
     return cast(dict[str, Any], send_to_device(_make_batch(windows, rows), device))
@@ -163,11 +166,9 @@ def _observed(batch: dict[str, Any]) -> ObservationBatch:
 
 
 @torch.no_grad()
-def _validate(
-    policy: PolicyNetwork, windows: SequenceDataset, config: TrainConfig, seed: int
-) -> dict[str, float]:
-    """Return the loss, the error of the joint change (rad) planned over the chunk, and of sight (m)."""
-    batch = _validation_batch(policy, windows, config)
+def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dict[str, float]:
+    """Return the loss, the error of the joint change (rad) planned over the chunk, and of key poses (m)."""
+    batch = _validation_batch(policy, windows)
     generator = torch.Generator().manual_seed(seed)
     observed = _observed(batch)
     planned = policy.plan(observed, generator, key_pose=batch["key_pose"])

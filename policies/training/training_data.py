@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.faults import leave_out_faulty
 from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.schema import Episode
@@ -106,16 +105,6 @@ def find_task(chosen: Sequence[tuple[EpisodeSet, Sequence[int]]], task: str | No
             f"{root} does not name its task: add --task {', '.join(TASKS)} or a name of your own"
         )
     return found or str(task)
-
-
-def check_sensor(recorded: str, tried: str) -> None:
-    """Raise UserError if snapshots would be tried with another sensor than was recorded."""
-    tried = find_sensor(tried).name
-    if recorded and tried != recorded:
-        raise UserError(
-            f"the episodes were recorded with {recorded}, snapshots would be tried with {tried}: "
-            f"add --env.sensor {recorded}"
-        )
 
 
 def succeeded(meta: Mapping[str, Any]) -> bool | None:

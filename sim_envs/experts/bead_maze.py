@@ -3,6 +3,7 @@
 import numpy as np
 
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.rotations import fingers_across, rotation_matrix, rotation_vector
 from touchgoal.sim_envs.bead_maze import BeadMaze
 
@@ -14,7 +15,7 @@ _SLOW = 0.004  # m (or, times _LEVER, rad) of deviation at which motion along th
 _LEVER = 0.02  # m by which a turn counts as a displacement: the size of the bead
 
 
-class BeadMazeExpert:
+class BeadMazeExpert(Actor):
     """Leads the bead along the wire, the hand turned with the wire.
 
     It acts on the commanded pose, so that the arm's compliance does not add up; a bead that slipped

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.rotations import fingers_down, rotation_vector
 from touchgoal.sim_envs.fragile_carry import (
     GOAL,
@@ -27,7 +28,7 @@ _RETURN = 5.0  # 1/s: decay of a deviation, and speed per distance that is left
 _OVER = 0.003  # m beside the goal within which the rod is lowered
 
 
-class FragileCarryExpert:
+class FragileCarryExpert(Actor):
     """Lifts slowly, tightens as the rod slips, holds a reserve, and lowers the rod onto the rests.
 
     It acts on the present state alone, so that it can correct a policy anywhere. Of the truth it

@@ -6,6 +6,7 @@ from typing import get_args
 import numpy as np
 
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.hardware import GRIPPER_MAX_WIDTH
@@ -22,7 +23,7 @@ from touchgoal.sim_envs.pick_place import PickPlace
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 
 
-class PickPlaceExpert:
+class PickPlaceExpert(Actor):
     """Picks and places, or does what `outcome` says (`touchgoal.sim_envs.config.Outcome`)."""
 
     def __init__(

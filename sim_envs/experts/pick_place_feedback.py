@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
 from touchgoal.sim_envs.cell.hardware import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.experts.pick_place_plans import (
@@ -31,7 +32,7 @@ _RETURN, _LOWER = 5.0, 3.0  # 1/s: speed towards a place per distance to it; dow
 _TURN = 1.0  # rad/s
 
 
-class FeedbackExpert:
+class FeedbackExpert(Actor):
     """Picks and places from any state of arm and object.
 
     It follows a funnel over the object, then over the goal: the farther to the side, the higher. It acts
