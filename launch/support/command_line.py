@@ -44,7 +44,7 @@ def parse(
     short = not {"--help", "-h"}.isdisjoint(arguments)  # tyro does not accept what it hides
     typed = ["--help" if a == "--help-all" else a for a in arguments]
     env = envs[_task(typed, envs)] if envs else None
-    hidden_of = {name: _hidden(kind, env) for name, kind in _members(config_type)}
+    hidden_of = {name: _hidden(kind, env) for name, kind in members(config_type)}
     hidden = set().union(*hidden_of.values()) if short else set()
     registry = ConstructorRegistry()
     preset = next(reversed(list(_values(typed, "--preset"))), "")
@@ -172,30 +172,39 @@ def _bounds(annotation: Any) -> Iterator[str]:
 
 def _hidden(config_type: type, env: EnvConfig | None) -> set[tuple[type, str]]:
     """Return the options that --help hides: those marked RARE, and those after the first SHOWN."""
-    options = list(_all_options(config_type, env))
-    common = [key for key, is_rare in options if not is_rare]
-    return {key for key, is_rare in options if is_rare} | set(common[SHOWN:])
+    options = list(all_options(config_type, env))
+    common = [key for key, _, is_rare in options if not is_rare]
+    return {key for key, _, is_rare in options if is_rare} | set(common[SHOWN:])
 
 
-def _all_options(
-    config_type: type, env: EnvConfig | None, rare: bool = False
-) -> Iterator[tuple[tuple[type, str], bool]]:
-    """Yield every option and whether it or its group is marked RARE; groups come last."""
+def all_options(
+    config_type: type, env: EnvConfig | None, prefix: str = "--", rare: bool = False
+) -> Iterator[tuple[tuple[type, str], str, bool]]:
+    """Yield every option as class and field, as typed, and whether it is RARE; groups come last.
+
+    A positional argument is typed without dashes.
+    """
     groups = []
     for field, annotation, _ in _options(config_type):
-        is_rare = rare or RARE in getattr(annotation, "__metadata__", ())
+        marks, typed = (
+            getattr(annotation, "__metadata__", ()),
+            prefix + field.name.replace("_", "-"),
+        )
+        is_rare = rare or RARE in marks
         of_task = field.name == "env" and env is not None
         inner = type(env) if of_task else _bare(annotation)
         if dataclasses.is_dataclass(inner):
-            groups.append((inner, is_rare))
+            groups.append((inner, f"{typed}.", is_rare))
         else:
-            yield (config_type, field.name), is_rare
-    for inner, is_rare in groups:
+            if tyro.conf.Positional in marks:
+                typed = field.name
+            yield (config_type, field.name), typed, is_rare
+    for inner, start, is_rare in groups:
         assert isinstance(inner, type)
-        yield from _all_options(inner, env, is_rare)
+        yield from all_options(inner, env, start, is_rare)
 
 
-def _members(config_type: Any) -> Iterator[tuple[str, type]]:
+def members(config_type: Any) -> Iterator[tuple[str, type]]:
     """Yield names and dataclasses of subcommands; a single dataclass has the name ""."""
     if get_origin(config_type) in (Union, UnionType):
         for member in get_args(config_type):
