@@ -184,8 +184,8 @@ def test_every_option_is_described_and_set_by_a_test_a_page_or_a_recipe() -> Non
     text = "\n".join(path.read_text() for p in patterns for path in sorted(root.glob(p)))
     typed = {o.replace(".no-", ".") for o in re.findall(r"--(?:no-)?([a-z][\w.-]*\w)", text)}
     fields = set(re.findall(r"\b(\w+)=", text))  # of a Config made in Python
-    for command, options in options_by_command():
-        for (owner, field), option in options:
+    for command, options in options_by_command().items():
+        for option, (owner, field) in options.items():
             assert docstrings(owner).get(field), f"{owner.__name__}.{field} is not described"
             met = option[2:] in typed or field in fields or not option.startswith("--")
             assert met, f"{command} {option}: nobody sets it"
