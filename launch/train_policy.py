@@ -10,7 +10,7 @@ from touchgoal.policies.config import (
     ActionRepresentation,
     ArmState,
     Head,
-    SamplerOptions,
+    SamplerConfig,
     TouchInput,
     TrainConfig,
 )
@@ -43,7 +43,7 @@ _PAPER = {
     "position_noise": 0.0,
     "execution_horizon": 8,
     "train": TrainConfig(epochs=600, lr=1e-4, snapshot_epochs=100),
-    "sampler": SamplerOptions("ddpm", num_train_timesteps=100, num_inference_steps=100),
+    "sampler": SamplerConfig("ddpm", num_train_timesteps=100, num_inference_steps=100),
 }
 # Fifty demonstrations of a task of one's own, by cameras and touch.
 _SIGHT = {
@@ -55,7 +55,7 @@ _SIGHT = {
     "action_share": 0.98,
     "execution_horizon": 6,
     "train": TrainConfig(epochs=10, batch_size=64, lr=3e-3, snapshot_epochs=5),
-    "sampler": SamplerOptions(loss="absolute"),
+    "sampler": SamplerConfig(loss="absolute"),
 }
 
 
@@ -152,7 +152,7 @@ class Config(TrainingOptions):
     """Control ticks of a plan that are executed before the next plan."""
     train: TrainConfig = TrainConfig()
     """Epochs, learning rate, batches."""
-    sampler: Annotated[SamplerOptions, RARE] = SamplerOptions()
+    sampler: Annotated[SamplerConfig, RARE] = SamplerConfig()
     """Noise schedule and denoising of a diffusion policy."""
     trials: CountOrNone = 24
     """Number of validation episodes in which every snapshot is tried; 0 takes the last snapshot."""
@@ -242,7 +242,6 @@ def _policy_config(
     config: Config, episodes: "EpisodeSet", touch: "TouchEmbedder | None"
 ) -> "PolicyConfig":
     from touchgoal.control import features as ft
-    from touchgoal.policies.config import SamplerConfig
     from touchgoal.policies.heads.diffusion import DiffusionConfig
     from touchgoal.policies.heads.mlp import MLPConfig
     from touchgoal.policies.heads.unet import PRESETS
@@ -257,9 +256,7 @@ def _policy_config(
     if config.head != "regression":
         denoiser = MLPConfig() if config.head == "mlp" else PRESETS[config.head]
         predicts = "epsilon" if config.sampler.kind == "ddpm" else "sample"
-        head = DiffusionConfig(
-            denoiser, SamplerConfig(**vars(config.sampler), prediction_type=predicts)
-        )
+        head = DiffusionConfig(denoiser, replace(config.sampler, prediction_type=predicts))
     return PolicyConfig(
         touch_dim=touch.dim if touch else 0,
         touch=touch.name if touch else "",

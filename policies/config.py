@@ -7,6 +7,7 @@ from pydantic import Field
 from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import (
+    FIXED,
     Count,
     Positive,
     checked_dataclass,
@@ -35,7 +36,7 @@ POLICIES = {
 
 
 @checked_dataclass
-class SamplerOptions:
+class SamplerConfig:
     """Noise schedule in training, and denoising when a plan is made."""
 
     kind: Literal["ddpm", "ddim", "flow"] = "ddim"
@@ -48,31 +49,20 @@ class SamplerOptions:
     loss: Literal["squared", "absolute"] = "squared"
     """Error of the network in training: squared, as published, or absolute, which weighs rare large
     motions less."""
+    # Prediction of the network: the noise (epsilon) or the flow's velocity, as published, or the clean
+    # sample, which needs fewer steps and less training where samples vary little (Ze et al. 2024).
+    prediction_type: Annotated[Literal["epsilon", "velocity", "sample"], FIXED] = "sample"
+    clip: Annotated[Positive, FIXED] = 1.0  # largest magnitude of a clean sample, normalised
 
     def __post_init__(self) -> None:
+        if self.prediction_type == ("epsilon" if self.kind == "flow" else "velocity"):
+            raise UserError(
+                f"a network for {self.kind} cannot predict {self.prediction_type}: try sample"
+            )
         if self.kind != "flow" and self.num_inference_steps > self.num_train_timesteps:
             raise UserError(
                 f"num_inference_steps {self.num_inference_steps} exceed num_train_timesteps "
                 f"{self.num_train_timesteps}: some would do nothing, so ask for fewer"
-            )
-
-
-@checked_dataclass
-class SamplerConfig(SamplerOptions):
-    """Sampler of a diffusion head."""
-
-    prediction_type: Literal["epsilon", "velocity", "sample"] = "sample"
-    """Prediction of the network: the noise (epsilon) or the flow's velocity, as published, or the
-    clean sample, which needs fewer steps and less training where samples vary little (Ze et al.
-    2024)."""
-    clip: Positive = 1.0
-    """Largest magnitude of a clean sample, normalised."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.prediction_type == ("epsilon" if self.kind == "flow" else "velocity"):
-            raise UserError(
-                f"a network for {self.kind} cannot predict {self.prediction_type}: try sample"
             )
 
 
