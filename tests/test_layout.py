@@ -8,22 +8,21 @@ import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 
 import pytest
+from command_options import options_by_command
 
 from touchgoal.launch.__main__ import COMMANDS
-from touchgoal.launch.support.command_line import _all_options, _members
 
 # Ceilings fall with every change that removes, and rise only by the budget that an issue names,
 # in a change that says so.
-WHEEL_LINES = 51_900  # of Python
-REPOSITORY_LINES = 61_800  # of Python, outside tests/
-TEST_LINES = 16_100  # of Python
+WHEEL_LINES = 49_400  # of Python
+REPOSITORY_LINES = 60_000  # of Python, outside tests/
+TEST_LINES = 16_200  # of Python
 PAGE_WORDS = 12_100  # README, CHANGELOG and docs/*.md
-COMMANDS_IN_ALL = 33  # sub-commands included
-OPTIONS_IN_ALL = 700  # of all commands, each with its own
+COMMANDS_IN_ALL = 40  # sub-commands included
+OPTIONS_IN_ALL = 400  # of all commands, each with its own
 
 ROOT = Path(__file__).parents[1]
 _PAGE = (ROOT / "CONTRIBUTING.md").read_text()
@@ -164,12 +163,6 @@ def test_lines_and_words_stay_under_their_ceilings() -> None:
 
 
 def test_commands_and_options_stay_under_their_ceilings() -> None:
-    """Options of the environment are counted for the first task alone."""
-    commands = options = 0
-    for name in COMMANDS:
-        command = import_module(f"touchgoal.launch.{name.replace('-', '_')}")
-        env = next(iter(getattr(command, "ENVS", {"": None}).values()))
-        members = list(_members(command.Config))
-        commands += 1 + sum(bool(member) for member, _ in members)
-        options += sum(len(list(_all_options(kind, env))) for _, kind in members)
-    assert commands <= COMMANDS_IN_ALL and options <= OPTIONS_IN_ALL
+    found = options_by_command()  # of sub-commands; the command that has them counts, too
+    assert len({*found, *COMMANDS}) <= COMMANDS_IN_ALL
+    assert sum(map(len, found.values())) <= OPTIONS_IN_ALL
