@@ -55,7 +55,6 @@ BENCHMARKS = {
     "encoder-speed": ("speed.encoder_speed", "touch embeddings a second"),
     "env-speed": ("speed.env_speed", "steps of the environment a second"),
     "policy-latency": ("speed.policy_latency", "time of a plan, stage by stage"),
-    "scaling": ("speed.scaling", "collection and embedding on more cores, and on Ray"),
     "tactile-speed": ("speed.tactile_speed", "simulated tactile images a second"),
 }
 """Module in `benchmarks` and meaning of each benchmark."""
