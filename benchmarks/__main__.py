@@ -51,12 +51,10 @@ BENCHMARKS = {
     "faults": ("deployment.faults", "what a deployment does under every fault"),
     "policy-delay": ("deployment.policy_delay", "success under delays, or by cause of failure"),
     "own-task": ("deployment.own_task", "a task known by demonstrations alone: success by sight"),
-    "audit": ("deployment.audit", "inputs that a policy's success depends on"),
     "robustness": ("deployment.robustness", "success under changes that training has not shown"),
     "encoder-speed": ("speed.encoder_speed", "touch embeddings a second"),
     "env-speed": ("speed.env_speed", "steps of the environment a second"),
     "policy-latency": ("speed.policy_latency", "time of a plan, stage by stage"),
-    "scaling": ("speed.scaling", "collection and embedding on more cores, and on Ray"),
     "tactile-speed": ("speed.tactile_speed", "simulated tactile images a second"),
 }
 """Module in `benchmarks` and meaning of each benchmark."""

@@ -133,8 +133,6 @@ def test_learning_the_bead_maze(here: Path, capsys: pytest.CaptureFixture) -> No
         "--changes", "light +10%", "2 ticks late", "--episodes", 1, "--workers", 1)  # fmt: skip
     printed = capsys.readouterr().out
     assert "pick-place, light +10%" in printed and "pick-place, 2 ticks late" in printed
-    run_benchmark("audit", "--policy", "expert", "--tasks", "pick-place", "--episodes", 1, *one)
-    assert "pick-place, arm's state of another episode" in capsys.readouterr().out
     run_benchmark("policy-latency", "--policy", "policy/policy", "--repeats", 3,
         "--large-repeats", 0)  # fmt: skip
     assert "denoising" in capsys.readouterr().out

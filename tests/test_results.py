@@ -6,6 +6,9 @@ from documented_commands import recipes
 from benchmarks import records
 from benchmarks.__main__ import main
 from benchmarks.records import QUOTED
+from touchgoal.runtime import seeds
+
+RANGES = (seeds.TRAINING, seeds.VALIDATION, seeds.DISTURBED, *seeds.CORRECTIONS)
 
 
 @pytest.mark.parametrize("page", records.pages(), ids=lambda page: page.name)
@@ -36,6 +39,7 @@ def test_no_two_recordings_share_a_seed(target: str) -> None:
     for step in recipes(target):
         if step[0] == "collect-demos":
             episodes, seed = (int(step[step.index(o) + 1]) for o in ("--episodes", "--seed"))
+            assert any(seed == r.start and episodes <= r.count for r in RANGES)
             recorded |= set(range(seed, seed + episodes))
             asked += episodes
     assert len(recorded) == asked > 400

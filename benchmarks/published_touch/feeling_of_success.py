@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.published_touch.labels import booleans, entry
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
-from touchgoal.episodes.importers.touch_clip import TouchClip, check_sensor, encoded_pictures
+from touchgoal.episodes.importers.touch_clip import TouchClip, encoded_pictures
 from touchgoal.runtime.errors import UserError
 
 MOMENTS = ("before", "during", "after")
@@ -36,26 +36,25 @@ class GraspTrial:
     fingers: tuple[TouchClip, TouchClip]  # each one's images at `MOMENTS`, the first untouched
 
 
-def read_grasps(folder: Path, sensor: str | None = None) -> Iterator[GraspTrial]:
+def read_grasps(folder: Path) -> Iterator[GraspTrial]:
     """Read the grasps of a folder, one file at a time.
 
-    UserError: no such files, another sensor's, or a content that is not as published.
+    UserError: no such files, or a content that is not as published.
     """
     paths = _files(folder)
     if not paths:
         raise UserError(
             f"{folder} holds no 000.pkl to 035.pkl: give a folder of Feeling of Success"
         )
-    named = check_sensor(sensor, ("gelsight", "gelsight_markers"), folder)
     for path in paths:
-        yield from _read(path, named)
+        yield from _read(path)
 
 
 def _files(folder: Path) -> list[Path]:
     return sorted(p for p in folder.glob("*.pkl") if re.fullmatch(r"\d{3}\.pkl", p.name))
 
 
-def _read(path: Path, sensor: str) -> Iterator[GraspTrial]:
+def _read(path: Path) -> Iterator[GraspTrial]:
     value = read_plain_pickle(path)
     held = booleans(_plain(entry(value, "is_gripping", str(path))), f"'is_gripping' of {path}")
     names = _plain(entry(value, "object_name", str(path)))
@@ -71,7 +70,7 @@ def _read(path: Path, sensor: str) -> Iterator[GraspTrial]:
     for i, (name, holds) in enumerate(zip(names, held, strict=True)):
         title = f"{path} grasp {i}"
         first, second = (
-            TouchClip(f"{title} ({f})", sensor, [columns[f, m][i] for m in MOMENTS], True)
+            TouchClip(f"{title} ({f})", "gelsight", [columns[f, m][i] for m in MOMENTS], True)
             for f in "AB"
         )
         yield GraspTrial(title, _text(name, title), bool(holds), held_out, (first, second))

@@ -2,8 +2,8 @@
 
 A reference walks in straight lines from target to target, each within the policy's period, or
 slower where it would turn faster than the limits allow. The command is the reference's mean over a
-short window: it stays in the reference's range and delays all joints alike. It cuts corners;
-`python -m benchmarks sent-stream` measures by how much.
+short window: it stays in the reference's range and delays all joints alike. It cuts corners, which
+`SafetyLimits.reserve` allows for.
 """
 
 from dataclasses import dataclass, replace

@@ -75,8 +75,8 @@ class RobotLimits:
 #   `Robot::setCollisionBehavior`; its examples set 20 N and 20 Nm).
 # - indentation: twice the deepest press into a Mini in FEATS (0.86 mm). In simulation a golf ball at
 #   30 N, the least force of a Franka Hand (product manual), goes in by 1.2 mm, a pebble's edge by 2.
-# - reserve: the stream was at most 0.45 mm beside the commands' path in an hour
-#   (python -m benchmarks sent-stream); a third more.
+# - reserve: the stream was at most 0.45 mm beside the commands' path in an hour of
+#   wild commands; a third more.
 # - tip_speed: twice the reduced speed of ISO 10218-1, 0.25 m/s. Set that in the cell file on the first
 #   day, when a person may be near.
 # - tracking: our choice, without a source.
@@ -97,7 +97,7 @@ _LEVER = 0.6  # m: farthest that a hand over the table is from the axis of a joi
 
 @dataclass(frozen=True)
 class TaskForces:
-    """Peaks over a task's successful demonstrations (their number: `episodes`), seeds from 30000.
+    """Peaks over a task's successful demonstrations.
 
     `force` is on the hand, N; `indentation` in a gel, m, as `control.tactile.indentation` measures
     it.
@@ -105,7 +105,6 @@ class TaskForces:
 
     force: float
     indentation: float
-    episodes: int
 
     @property
     def force_ceiling(self) -> float:
@@ -123,11 +122,11 @@ class TaskForces:
         return _CEILING_MARGIN * self.indentation
 
 
-# By `python -m benchmarks task-ceilings`: 60 episodes of pick-place, and 60 with --feedback; 29 of the maze with
-# a disturbance of 4 mm/s for the force, and six without for the indentation.
+# 60 episodes of pick-place, and 60 with --feedback; 29 of the maze with a disturbance of 4 mm/s for
+# the force, and six without for the indentation.
 TASK_FORCES: dict[str, TaskForces] = {
-    "pick-place": TaskForces(force=16.5, indentation=2.1e-3, episodes=120),
-    "bead-maze": TaskForces(force=17.9, indentation=1.15e-3, episodes=29),
+    "pick-place": TaskForces(force=16.5, indentation=2.1e-3),
+    "bead-maze": TaskForces(force=17.9, indentation=1.15e-3),
 }
 
 

@@ -24,7 +24,7 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
 
 # Thresholds lie between what whole pictures and faulty ones reach, on the real frames of three
-# Minis and two DIGITs (tests/measure_picture_guard.py prints the table).
+# Minis and two DIGITs.
 _SEAM, _STEP = 3.5, 6.0  # times the usual step from row to row; counts, the channels' sum
 _EDGE = 10  # share of a picture (1/n) at either end where a seam may be the sensor's case
 # Counts, the channels' sum: in simulation the edge of a block pressed with 40 N changes a side by 17.

@@ -120,7 +120,7 @@ DIGIT = SensorModel(
 # be a tenth too small. With it, golf ball dimples in EstimateModulus' pictures are 3.9 mm apart;
 # 300 to 400 dimples on a ball would be 4.1 to 4.7 mm apart. Frame rate: that of these pictures.
 # Gel: as large as the picture; case: a margin around it. Thickness and moduli were not found: the
-# Mini's. Sensor file: computed from lamp positions (`led_ring.py`), because no pictures of rigid
+# Mini's. Sensor file: computed from lamp positions, because no pictures of rigid
 # balls may be shipped.
 GELSIGHT_WEDGE = replace(
     GELSIGHT_MINI,

@@ -56,7 +56,7 @@ def run(config: Config) -> dict[str, Any]:
     encoders = {name: _encoder(name, sensor, config) for name in config.encoders}
     short = Path(config.rig.sensor).name  # also the name of a sensor file's folder
     folder = config.data or Path("runs") / f"tacbench_{short}_{config.rig.seed}"
-    recordings = dict.fromkeys(RECORDED_AS[task] for task in config.tasks)
+    recordings: dict[Recording, None] = dict.fromkeys(RECORDED_AS[t] for t in config.tasks)
     readings: dict[Recording, Reading] = {w: _record(w, folder, config) for w in recordings}
     bench = Bench(config, sensor, folder, encoders)
     kept = f"recordings are in {folder}; probes are not saved"
