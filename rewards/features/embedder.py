@@ -29,8 +29,8 @@ from touchgoal.rewards.features.embedded import (
     EmbeddedGoal,
     Features,
     camera_name,
-    cameras_of,
     join_rows,
+    last_rows,
     map_name,
     split_features,
     take_rows,
@@ -87,6 +87,9 @@ class EpisodeEmbedder:
         self.knows_words = self._aligned is not None  # touch can be compared with sentences
         self.camera, self.parts = camera, parts
         self._ends: dict[Bank | GoalFile, SuccessfulEnds] = {}
+        self._goals: dict[
+            tuple[EpisodeEnd, tuple[str, ...]], Features
+        ] = {}  # by keys that are read
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
         self._images_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
         self.made_with = self._images_with  # of episodes with touch, if there is an encoder
@@ -229,24 +232,31 @@ class EpisodeEmbedder:
         if isinstance(spec, GoalImage):
             return self.embed_cameras({main: spec.read()})
         if isinstance(spec, EpisodeEnd):
-            seen = [key for key in (*CAMERAS, main) if camera_name(key) in cameras_of(own.features)]
-            frames = spec.read(tuple(dict.fromkeys(seen)) or (main,)).frames
-            return self.embed_cameras({k: v[-1:] for k, v in frames.items() if is_camera(k)})
+            seen = [key for key in (*CAMERAS, main) if camera_name(key) in own.features]
+            key = spec, tuple(dict.fromkeys(seen)) or (main,)
+            if key not in self._goals:
+                frames = spec.read(key[1]).frames
+                last = {k: v[-1:] for k, v in frames.items() if is_camera(k)}
+                self._goals[key] = self.embed_cameras(last)
+            return self._goals[key]
         return split_features(self._end(spec, own))[0]
 
     def _goal_of_touch(self, spec: TouchGoal, own: EmbeddedEpisode) -> Features:
         if isinstance(spec, OwnFrame | Bank | GoalFile):
             return split_features(self._end(spec, own))[1]
         if isinstance(spec, EpisodeEnd):
-            read = spec.read(own.sides)
-            end = self.embed_episode(replace(read, meta={}), own.fps, str(spec))
-        else:
-            frames = {
-                side: np.stack([*[spec.backgrounds[side]] * START_FRAMES, spec.images[side]])
-                for side in own.sides
-            }
-            end = self.stream(frames, own.fps, str(spec)).embed(frames)
-        return split_features(take_rows(end.features, slice(len(end) - 1, None)))[1]
+            key = spec, own.sides
+            if key not in self._goals:
+                read = replace(spec.read(own.sides), meta={})
+                embedded = self.embed_episode(read, own.fps, str(spec))
+                self._goals[key] = split_features(last_rows([embedded]))[1]
+            return self._goals[key]
+        frames = {
+            side: np.stack([*[spec.backgrounds[side]] * START_FRAMES, spec.images[side]])
+            for side in own.sides
+        }
+        end = self.stream(frames, own.fps, str(spec)).embed(frames)
+        return split_features(last_rows([end]))[1]
 
     def _end(self, spec: OwnFrame | Bank | GoalFile, own: EmbeddedEpisode) -> Features:
         """Return a frame of the trajectory, or the ends of successes, which are embedded once."""
