@@ -279,8 +279,8 @@ def parse_goal(text: str, keys: Mapping[str, str] | None = None) -> GoalSpec:
     raise UserError(f"goal '{text}' is not understood; write {FORMS}")
 
 
-def goals_of_script(goal: GoalLike) -> list[GoalSpec]:
-    """Return a script's goal, arrays or text, as goals; UserError: it is none."""
+def goals_of_script(goal: GoalLike | Sequence[GoalLike]) -> list[GoalSpec]:
+    """Return a script's goals, arrays or text; UserError: one is no goal."""
     if isinstance(goal, GoalSpec):
         return [goal]
     if isinstance(goal, np.ndarray):
@@ -291,10 +291,14 @@ def goals_of_script(goal: GoalLike) -> list[GoalSpec]:
             raise UserError(f"goal {goal} is not a frame: count from 0, or give 'last'")
         return [OwnFrame(goal)]
     if isinstance(goal, str):
-        known = goal.strip() == "last" or re.match(
-            r"\s*(frame|image|episode|bank|goal|text):", goal
-        )
+        known = goal.strip() == "last" or re.match(r"\s*(frame|image|episode|bank|goal|text):", goal)
         return [parse_goal(goal) if known else Sentence(goal)]
+    if isinstance(goal, Mapping):
+        return _goals_of_arrays(goal)
+    return [spec for one in goal for spec in goals_of_script(one)]
+
+
+def _goals_of_arrays(goal: Mapping[str, np.ndarray]) -> list[GoalSpec]:
     for name, image in goal.items():
         if name != "image" and name not in SIDES:
             raise UserError(f"a goal has no '{name}': give image, left, right or several of them")
@@ -333,7 +337,10 @@ def assign_goals(
                 f"{' and '.join(wanted)}; put it first or leave it out"
             )
         taken |= dict.fromkeys(free, spec)
-    return Goal(**taken)  # pyright: ignore[reportArgumentType]  modalities fixes the types
+    image, touch, text = (taken.get(name) for name in MODALITIES)
+    assert isinstance(image, ImageGoal | None) and isinstance(touch, TouchGoal | None)
+    assert isinstance(text, Sentence | None)
+    return Goal(image, touch, text)
 
 
 def check_goal(goal: Goal, inputs: Inputs) -> None:

@@ -126,8 +126,7 @@ class Reward:
         Raises:
             UserError: a goal that is none, a normalizer that cannot be read.
         """
-        goals = list(goal) if isinstance(goal, list | tuple) else [goal]
-        self.goals = [spec for one in goals for spec in goals_of_script(one)]
+        self.goals = goals_of_script(goal)
         self._encoder, self._towers, self._plain, self._device = encoder, towers, plain, device
         self._choice: str | None = None  # "encoder", "none", or None to choose by the scene
         self._given: DistanceNormalizer | None = None

@@ -150,7 +150,7 @@ def part_costs(mine: Features, goal: Features, units: Mapping[str, float]) -> Co
             costs[name] = square / (square + half)
     if "held" not in mine or "held" not in goal:
         return costs
-    touching, wanted = mine["held"].any(axis=1), bool(goal["held"].any())
+    touching, wanted = mine["held"].max(axis=1), bool(goal["held"].any())
     gated = {k: gate(c, touching, wanted) for k, c in costs.items() if k in TOUCH_PARTS}
     return costs | gated
 
