@@ -291,7 +291,9 @@ def goals_of_script(goal: GoalLike | Sequence[GoalLike]) -> list[GoalSpec]:
             raise UserError(f"goal {goal} is not a frame: count from 0, or give 'last'")
         return [OwnFrame(goal)]
     if isinstance(goal, str):
-        known = goal.strip() == "last" or re.match(r"\s*(frame|image|episode|bank|goal|text):", goal)
+        known = goal.strip() == "last" or re.match(
+            r"\s*(frame|image|episode|bank|goal|text):", goal
+        )
         return [parse_goal(goal) if known else Sentence(goal)]
     if isinstance(goal, Mapping):
         return _goals_of_arrays(goal)

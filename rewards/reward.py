@@ -178,8 +178,9 @@ class Reward:
                 read, a goal that no modality takes.
         """
         if isinstance(recording, EpisodeSet | str | Path):
-            root = recording.root if isinstance(recording, EpisodeSet) else Path(recording)
-            source = open_source(root, camera)
+            opened = isinstance(recording, EpisodeSet)
+            root, keys = (recording.root, recording.keys) if opened else (Path(recording), None)
+            source = open_source(root, camera, keys=keys)
             if source.skipped:
                 raise UserError(source.skipped[0].reason)
             prepared = self.prepare_source(source)

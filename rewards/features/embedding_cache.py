@@ -48,7 +48,8 @@ def kept_file(embedder: EpisodeEmbedder, trajectory: Trajectory) -> Path | None:
     """Return the file of an episode's embedding, named by content and encoders; None for videos."""
     if not isinstance(trajectory, EpisodeTrajectory):
         return None
-    made_of = json.dumps([_FORMAT, embedder.fingerprint, trajectory.keys])
+    read = trajectory.keys, sorted(trajectory.episodes.keys.items())
+    made_of = json.dumps([_FORMAT, embedder.fingerprint, read])
     folder = f"rewards-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
     return embedding_file(trajectory.episodes, trajectory.index, folder, ".npz")
 
