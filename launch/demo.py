@@ -42,10 +42,11 @@ def main(config: Config) -> None:
     from touchgoal.episodes.film import write_film
     from touchgoal.episodes.recording import EpisodeSpec, record_with_film
     from touchgoal.episodes.store import EpisodeWriter
-    from touchgoal.rewards.goals import Inputs, parse_goal
+    from touchgoal.rewards.curves import FUSED
+    from touchgoal.rewards.goals import Inputs
     from touchgoal.rewards.report.report import write_report
-    from touchgoal.rewards.report.summary import metrics_table
-    from touchgoal.rewards.reward_model import load_reward_model
+    from touchgoal.rewards.report.tables import metrics_table
+    from touchgoal.rewards.reward import Reward
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.run_folder import open_run
     from touchgoal.sim_envs.pick_place import PickPlace
@@ -54,8 +55,7 @@ def main(config: Config) -> None:
     inputs = Inputs(
         "the demo's episode", FRONT, TACTILE, sensor, "simulated pick-place", cameras=CAMERAS
     )
-    goals = [parse_goal("last"), parse_goal(f"text:{config.words}")]
-    model = load_reward_model(inputs, goals)
+    reward = Reward(["last", f"text:{config.words}"]).prepare(inputs)
     out = open_run(config.out, "demo", config)
 
     env, hz = PickPlace(config.env), config.env.control_hz
@@ -64,9 +64,9 @@ def main(config: Config) -> None:
     env.close()
     held = until_release(episode)
     EpisodeWriter(out / "episodes", hz).append(held)
-    curves = model.curves(model.embedder.embed_episode(held, hz, str(held.meta["object"])))
-    write_report(curves, out, "curves", model.provenance())
-    shown = {k: c for k, c in curves.costs.items() if k == "fused" or k not in curves.parts}
+    curves = reward.curves(reward.embedder.embed_episode(held, hz, str(held.meta["object"])))
+    write_report(curves, out, "curves", reward.provenance())
+    shown = {FUSED: curves.parts[FUSED], **curves.plain}
     write_film(out / "episode.mp4", pictures, episode, hz, shown, "distance to goal")
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
     write_json(out / "metrics.json", {k: m.as_dict() for k, m in curves.metrics().items()})

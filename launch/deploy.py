@@ -71,7 +71,7 @@ def main(config: Config) -> None:
     policy, camera_size = load_policy(cell)
     cost = None
     if cell.task.rewards:
-        from touchgoal.rewards.online.cost_meter import load_cell_cost
+        from touchgoal.rewards.online import load_cell_cost
 
         cost = load_cell_cost(cell)
     check_client(cell)

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from touchgoal.runtime.option_types import RARE, CountOrNone, Seed, checked_dataclass
+from touchgoal.runtime.option_types import RARE, CountOrNone, checked_dataclass
 
 
 @checked_dataclass
@@ -47,10 +47,6 @@ class Config:
     without --encoder, only images are measured."""
     assume_success: bool = False
     """Take episodes without a recorded outcome as successes."""
-    seed: Seed = 0
-    """Random seed of the training of the value."""
-    device: str = "cpu"
-    """Torch device of the encoders: cpu, cuda or cuda:1."""
     out: Path | None = None
     """Folder of the run."""
 
@@ -59,14 +55,20 @@ def main(config: Config) -> None:
     """Check, embed, fit, and write normalizer.json."""
     from touchgoal.episodes.keys import parse_keys
     from touchgoal.episodes.schema import Episode, joined
-    from touchgoal.rewards.demonstration_costs import accepted_failures, last_costs
     from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
     from touchgoal.rewards.distance.normalizer import NORMALIZER
+    from touchgoal.rewards.features.embedding_cache import embed_trajectory
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
-    from touchgoal.rewards.reward_model import load_embedder
+    from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.open_source import open_successes
-    from touchgoal.rewards.success import SUCCESS, check_demonstrations, fit_success
-    from touchgoal.rewards.value.fit_value import LEAST_EPISODES, fit_value
+    from touchgoal.rewards.success import (
+        SUCCESS,
+        accepted_failures,
+        check_demonstrations,
+        fit_success,
+        last_costs,
+    )
+    from touchgoal.rewards.value import LEAST_EPISODES, fit_value
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.progress import track
     from touchgoal.runtime.provenance import provenance
@@ -76,7 +78,7 @@ def main(config: Config) -> None:
     with_touch = config.towers is None or config.encoder is not None
     sources = open_successes(config.sources, config.camera, with_touch, config.assume_success, keys)
     inputs = sources[0].inputs
-    embedder, _ = load_embedder(inputs, config.encoder, config.towers, config.device)
+    embedder = Reward(encoder=config.encoder, towers=config.towers).embedder(inputs)
     trajectories = [t for source in sources for t in source.trajectories]
     if config.success_from:
         check_demonstrations(config.success_from)
@@ -88,14 +90,14 @@ def main(config: Config) -> None:
             )
     out = open_run(config.out, "fit-normalizer", config)
     embedded = [
-        embedder.embed_chunks(t.chunks(), t.fps, t.source, descriptions=True)
+        embedder.describe(embed_trajectory(embedder, t), t.meta)
         for t in track(trajectories, "embedding", "trajectory")
     ]
     calibration = embedded[len(embedded) - config.success_from :]
     embedded = embedded[: len(embedded) - config.success_from]
     modalities = config.modalities or tuple(m for m in embedded[0].modalities if m != "text")
     normalizer = fit_normalizer(embedded, modalities, inputs.scene)
-    value = fit_value(embedded, inputs.fitted_task, config.seed) if config.value else None
+    value = fit_value(embedded, inputs.fitted_task) if config.value else None
     ends = SuccessfulEnds.of(embedded)
     normalizer.save(out / NORMALIZER)
     ends.save(out / GOAL_FILE)

@@ -2,22 +2,20 @@
 
 A goal is: last (the last frame), frame:K, image:PATH, episode:ROOT#K (the end of another episode)
 or text:SENTENCE (how the object feels). Each modality (image, touch, text) takes the first goal that
-applies to it. The cost is the distance to the goal; rewards are -cost, and gamma * Phi' - Phi with
-Phi = -cost (Ng et al. 1999).
+applies to it. The cost is the distance to the goal; rewards are -cost, and its fall from frame to
+frame (Ng et al. 1999). Embeddings of a set are kept inside it: another goal takes seconds.
 
 What is broken is skipped and listed in skipped.csv; the exit status is 1 only if nothing could be
 measured. The same command with the same --out continues an interrupted run.
 """
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from pydantic import Field
 
-from touchgoal.runtime.option_types import RARE, Count, CountOrNone, Positive, checked_dataclass
+from touchgoal.runtime.option_types import RARE, CountOrNone, Positive, checked_dataclass
 
 
 @checked_dataclass
@@ -49,19 +47,13 @@ class Config:
     normalizer: str | None = None
     """Normalizer of the distances: a normalizer.json of fit-normalizer; encoder, the one that comes
     with the encoder; or none. Default: the encoder's one for simulated pick-and-place, else none."""
-    gamma: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Discount per second of the potential-based reward gamma * Phi' - Phi; with 1 standing still pays
-    nothing. For an RL algorithm that discounts by g per frame it is g to the power of fps."""
+    plain: bool = False
+    """Measure plain distances of image, touch and text in place of the parts of the cost."""
     plots: CountOrNone = 100
     """Number of trajectories, from the first, that get a plot of their own."""
     audit: CountOrNone = 0
     """Number of trajectories, from the first, whose touch is replaced to see if it mattered. They are
-    embedded once more and held in memory; goals must come from other trajectories."""
-    rerun: str | None = None
-    """Also show cameras, fingertips and curves of the trajectories with a plot in the rerun viewer (extra
-    viz): live, or an .rrd file to write."""
-    workers: Count = 2
-    """Number of threads that decode ahead of the encoders."""
+    held in memory; goals must come from other trajectories."""
     ray: str | None = None
     """Address of a Ray cluster whose cores embed trajectories side by side, in place of this process;
     auto: the one started on this machine."""
@@ -75,57 +67,53 @@ def main(config: Config) -> None:
     """Check, measure what is not measured yet, and write the reports."""
     from touchgoal.episodes.keys import parse_keys
     from touchgoal.rewards.audit import audit_trajectories
-    from touchgoal.rewards.default_goal import goals_of
-    from touchgoal.rewards.embed_trajectories import EncoderOptions, embed_here, embed_on_ray
-    from touchgoal.rewards.goals import Bank, OwnFrame, assign_goals, parse_goal
-    from touchgoal.rewards.measure import Measurement, write_skipped
+    from touchgoal.rewards.goals import Bank, OwnFrame, parse_goal
+    from touchgoal.rewards.measure import (
+        EncoderOptions,
+        Measurement,
+        embed_here,
+        embed_on_ray,
+        write_skipped,
+    )
     from touchgoal.rewards.report.frame_table import FRAMES
     from touchgoal.rewards.report.page import PAGE
     from touchgoal.rewards.report.report import report_all
-    from touchgoal.rewards.report.rerun_recording import write_recording
-    from touchgoal.rewards.reward_model import RewardModel, load_reward_model
+    from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.open_source import open_source
-    from touchgoal.rewards.sources.trajectory import Trajectory
     from touchgoal.rewards.success import load_success_threshold
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.run_folder import open_run
-    from touchgoal.runtime.viewer.stream import LIVE, load_rerun
 
-    if config.rerun is not None:
-        load_rerun(config.rerun)
     if config.ray is not None and config.device != "cpu":
         raise UserError("--ray works on the cores of a cluster: leave out --device")
     keys = parse_keys(config.keys)
+    reward = Reward(
+        [parse_goal(text, keys) for text in config.goal],
+        encoder=config.encoder,
+        towers=config.towers,
+        normalizer=config.normalizer,
+        plain=config.plain,
+        device=config.device,
+    )
     with_touch = config.towers is None or config.encoder is not None
     source = open_source(config.source, config.camera, config.index, with_touch, config.fps, keys)
     if source.summary:
         print(source.summary)
-    given = [parse_goal(text, keys) for text in config.goal]
-    goals = {} if given else goals_of(source.trajectories)
-    if any(isinstance(goal, Bank) for goal in goals.values()):
+    rewards = reward.prepare_source(source)
+    specs = [spec for one in rewards.values() for spec in one.goal.specs]
+    if not config.goal and any(isinstance(spec, Bank) for spec in specs):
         print("failures are among the episodes: the goal is the nearest end of other successes")
-    elif OwnFrame() in given and any(t.meta.get("success") is False for t in source.trajectories):
+    elif OwnFrame() in specs and any(t.meta.get("success") is False for t in source.trajectories):
         print("failures are among the trajectories; with goal last they end at cost 0, too")
-    first = given or list(goals.values())[:1]
-    model = load_reward_model(
-        source.inputs, first, config.encoder, config.towers, config.normalizer, config.device
-    )
-    print(model.note)
-
-    def model_of(trajectory: Trajectory) -> RewardModel:
-        if given:
-            return model
-        goal = assign_goals([goals[trajectory.name]], source.inputs.modalities)
-        return replace(model, goal=goal)
-
-    if config.audit and any(isinstance(g, OwnFrame) for g in (*given, *goals.values())):
+    if config.audit and any(isinstance(spec, OwnFrame) for spec in specs):
         raise UserError("--audit needs goals from other trajectories: --goal bank:SET, for example")
+    first = rewards[source.trajectories[0].name]
+    print(first.note)
     out = open_run(config.out, "reward-curves", config)
-    measurement = Measurement(source.trajectories, model_of, out, config.gamma, config.plots)
-    embed = partial(embed_here, embedder=model.embedder, workers=config.workers)
+    measurement = Measurement(source.trajectories, rewards, out, config.plots)
+    embed = partial(embed_here, embedder=first.embedder)
     if config.ray is not None:
-        parts = model.embedder.with_parts
-        options = EncoderOptions(source.inputs, config.encoder, config.towers, parts)
+        options = EncoderOptions(source.inputs, config.encoder, config.towers, first.embedder.parts)
         embed = partial(embed_on_ray, options=options, address=config.ray)
     total = len(source.trajectories) + len(source.skipped)
     if done := len(measurement.records):
@@ -140,13 +128,9 @@ def main(config: Config) -> None:
     summary = write_skipped(skipped, total, out)
     if not measurement.records:
         raise UserError(f"nothing could be measured: {skipped[0].reason}")
-    threshold = load_success_threshold(config.normalizer)
+    threshold = None if config.plain else load_success_threshold(config.normalizer)
     audited = source.trajectories[: config.audit]
-    audit = audit_trajectories(audited, model_of).table if audited else ""
-    report_all(measurement.records, out, model.provenance(), threshold, audit)
-    if config.rerun is not None:
-        write_recording(config.rerun, source.trajectories[: config.plots], measurement.records)
-        if config.rerun != LIVE:
-            print(f"look at it: rerun {config.rerun}")
+    audit = audit_trajectories(audited, rewards).table if audited else ""
+    report_all(measurement.records, out, first.provenance(), threshold, audit)
     print(f"{summary}; {speed}")
     print(f"next: look at {out / PAGE}; train on {out / FRAMES}")

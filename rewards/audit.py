@@ -5,7 +5,7 @@ paired by episode, their intervals a bootstrap over episodes. The goal must not 
 episode itself: against its own end every replacement costs more, even if touch is useless.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -13,12 +13,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from touchgoal.encoders.probes.bootstrap import mean_interval, percentile_interval
-from touchgoal.rewards.curves import Curves
-from touchgoal.rewards.distance.embedding_distance import compute_curves
-from touchgoal.rewards.distance.parts import FUSED
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.curves import FUSED, Curves
+from touchgoal.rewards.distance.cost import compute_curves
+from touchgoal.rewards.features.embedded import (
+    FINGERTIPS,
+    TOUCH,
+    EmbeddedEpisode,
+    EmbeddedGoal,
+)
+from touchgoal.rewards.features.embedding_cache import embed_trajectory
 from touchgoal.rewards.metrics import auc, measure_curve
-from touchgoal.rewards.reward_model import RewardModel
+from touchgoal.rewards.reward import PreparedReward
 from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
@@ -125,7 +130,9 @@ def audit_touch(
     """
     _check(episodes, goals)
     if FUSED not in measure(episodes[0], goals[0]).costs:
-        raise UserError("an audit of touch needs the fused cost: give a --normalizer with units")
+        raise UserError(
+            "an audit of touch needs the fused cost: give a --normalizer with units, and leave --plain out"
+        )
     real = _measured(episodes, goals, measure)
     rng, rows = np.random.default_rng(0), []
     replaced = {
@@ -143,18 +150,18 @@ def audit_touch(
 
 
 def audit_trajectories(
-    trajectories: Sequence[Trajectory], model_of: Callable[[Trajectory], RewardModel]
+    trajectories: Sequence[Trajectory], rewards: Mapping[str, PreparedReward]
 ) -> AuditTable:
-    """Embed trajectories and audit their touch; see `audit_touch`."""
-    models = [model_of(t) for t in trajectories]
-    embedded = [
-        model.embedder.embed_chunks(t.chunks(), t.fps, t.source)
-        for t, model in zip(track(trajectories, "auditing", "trajectory"), models, strict=True)
-    ]
-    goals = [m.embedder.embed_goal(m.goal, e) for m, e in zip(models, embedded, strict=True)]
+    """Embed trajectories and audit their touch by the reward of each name; see `audit_touch`."""
+    embedded, goals = [], []
+    for trajectory in track(trajectories, "auditing", "trajectory"):
+        reward = rewards[trajectory.name]
+        embedded.append(embed_trajectory(reward.embedder, trajectory))
+        goals.append(reward.embedder.embed_goal(reward.goal, embedded[-1]))
+    reward = rewards[trajectories[0].name]
 
     def measure(episode: EmbeddedEpisode, goal: EmbeddedGoal) -> Curves:
-        return compute_curves(episode, goal, models[0].normalizer, models[0].value)
+        return compute_curves(episode, goal, reward.normalizer, reward.value, plain=reward.plain)
 
     return audit_touch(embedded, goals, measure)
 
@@ -163,7 +170,7 @@ def _check(episodes: Sequence[EmbeddedEpisode], goals: Sequence[EmbeddedGoal]) -
     if len(episodes) < 2:
         raise UserError(f"an audit of touch needs at least two episodes, not {len(episodes)}")
     for episode, goal in zip(episodes, goals, strict=True):
-        if episode.touch is None:
+        if TOUCH not in episode.features:
             raise UserError(f"{episode.source} has no touch to audit: leave --audit out")
         if goal.same_episode:
             raise UserError(
@@ -207,9 +214,9 @@ def _with_touch(
     rows: Int[np.ndarray, " n"],
     sides: Int[np.ndarray, " s"],
 ) -> EmbeddedEpisode:
-    """Return an episode with touch and contact readings from rows and sides of a source."""
-    readings = None if source.readings is None else source.readings.take(rows).of_sides(sides)
-    return replace(episode, touch=source.touches()[sides][:, rows], readings=readings)
+    """Return an episode with touch from rows and sides of a source."""
+    felt = {k: v[rows][:, sides] for k, v in source.features.items() if k in FINGERTIPS}
+    return replace(episode, features={**episode.features, **felt})
 
 
 def _measured(

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import gymnasium as gym
 
@@ -13,8 +13,11 @@ from touchgoal.sim_envs.fragile_carry import FragileCarry
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tasks import ENVIRONMENTS
 
-Touch = Literal["picture", "embedding"]
-Reward = Literal["progress", "touch"]
+if TYPE_CHECKING:
+    from touchgoal.rewards.reward import Reward
+    from touchgoal.rewards.reward_wrapper import RewardWrapper
+
+Touch = Literal["image", "embedding"]
 _BY_NAME = {env.task: env for env in ENVIRONMENTS.values()}
 
 
@@ -23,6 +26,7 @@ def make(
     task: Literal["pick-place"],
     *,
     for_rl: Literal[False] = False,
+    reward: None = None,
     **options: Any,
 ) -> PickPlace: ...
 @overload
@@ -30,6 +34,7 @@ def make(
     task: Literal["bead-maze"],
     *,
     for_rl: Literal[False] = False,
+    reward: None = None,
     **options: Any,
 ) -> BeadMaze: ...
 @overload
@@ -37,17 +42,24 @@ def make(
     task: Literal["fragile-carry"],
     *,
     for_rl: Literal[False] = False,
+    reward: None = None,
     **options: Any,
 ) -> FragileCarry: ...
 @overload
 def make(
     task: str,
     *,
+    for_rl: Literal[False] = False,
+    reward: "Reward",
+    **options: Any,
+) -> "RewardWrapper": ...
+@overload
+def make(
+    task: str,
+    *,
     for_rl: Literal[True],
-    touch: Touch = "picture",
-    reward: Reward = "progress",
-    goal: str | None = None,
-    normalizer: str | Path | None = None,
+    reward: "Reward | None" = None,
+    touch: Touch = "image",
     encoder: str | Path | None = None,
     **options: Any,
 ) -> ForRL: ...
@@ -55,51 +67,47 @@ def make(
     task: str,
     *,
     for_rl: bool = False,
-    touch: Touch = "picture",
-    reward: Reward = "progress",
-    goal: str | None = None,
-    normalizer: str | Path | None = None,
+    reward: "Reward | None" = None,
+    touch: Touch = "image",
     encoder: str | Path | None = None,
     **options: Any,
 ) -> gym.Env:
     """Make the Gymnasium environment of a task.
 
+        env = touchgoal.make("pick-place", reward=touchgoal.Reward(goal="bank:data/episodes"))
         env = touchgoal.make("pick-place", for_rl=True, touch="embedding", cameras=())
         stable_baselines3.PPO("MultiInputPolicy", env).learn(100_000)
 
     Args:
         task: "pick-place", "bead-maze" or "fragile-carry".
         for_rl: keys without dots and actions in [-1, 1]; see `sim_envs.for_rl.ForRL`.
-        touch: tactile images at a quarter of their size, or embeddings. This option and the next
-            four need `for_rl`.
-        reward: gain in the task's progress, or the fall of the cost to a goal.
-        goal: goal of reward "touch", outside the episode: "goal:FILE", "bank:SET", "episode:SET#K".
-        normalizer: normalizer.json of reward "touch"; default: the touch encoder's own.
-        encoder: touch encoder of embeddings and of reward "touch"; default: the one that ships for the
-            sensor.
+        reward: the environment's reward is the fall of the cost to its goal, which must lie outside
+            the episode ("bank:SET", "episode:SET#K"); see `rewards.reward_wrapper.RewardWrapper`.
+            Default: the gain in the task's progress.
+        touch: tactile images at a quarter of their size, or embeddings. This option and the next one
+            need `for_rl`.
+        encoder: touch encoder of embeddings; default: the one that ships for the sensor.
         options: fields of the task's config by name, such as `cameras=("front",)`,
             `camera_size=(96, 96)` or `tactile=False`: see `sim_envs/config.py`. For a field that is
             itself a config, a dict of its changed fields:
             `randomization={"gain": 0.0}`. `render_mode="rgb_array"` is for video recorders.
 
     Raises:
-        UserError: there is no such task or option, a value is out of its range, or a goal is
-            missing.
+        UserError: there is no such task or option, a value is out of its range, or the goal of the
+            reward cannot be measured here.
     """
     if task not in _BY_NAME:
         raise UserError(f"unknown task {task!r}; choose from: {', '.join(_BY_NAME)}")
     env: gym.Env = _BY_NAME[task](**options)
+    if reward is not None:
+        from touchgoal.rewards.reward_wrapper import RewardWrapper
+
+        env = RewardWrapper(env, reward)
     if not for_rl:
-        if (touch, reward, goal, normalizer, encoder) != ("picture", "progress", None, None, None):
-            raise UserError("touch, reward, goal, normalizer and encoder need for_rl=True")
+        if (touch, encoder) != ("image", None):
+            raise UserError("touch and encoder need for_rl=True")
         return env
-    if (reward == "touch") != (goal is not None):
-        raise UserError('reward="touch" needs a goal outside the episode, and only it takes one')
-    if reward == "touch":
-        env = _with_touch_reward(env, str(goal), normalizer, encoder)
-    if touch == "embedding":
-        env = _with_embeddings(env, encoder)
-    return ForRL(env)
+    return ForRL(_with_embeddings(env, encoder) if touch == "embedding" else env)
 
 
 def make_vec(task: str, num_envs: int, **options: Any) -> gym.vector.AsyncVectorEnv:
@@ -117,17 +125,6 @@ def _make_in_worker(task: str, options: dict[str, Any]) -> ForRL:
 
     torch.set_num_threads(1)  # the workers are themselves many
     return make(task, for_rl=True, **options)
-
-
-def _with_touch_reward(
-    env: gym.Env, goal: str, normalizer: str | Path | None, encoder: str | Path | None
-) -> gym.Env:
-    from touchgoal.rewards.goals import parse_goal
-    from touchgoal.rewards.online.reward_wrapper import TouchReward, inputs_of
-    from touchgoal.rewards.reward_model import load_reward_model
-
-    model = load_reward_model(inputs_of(env), [parse_goal(goal)], encoder, normalizer=normalizer)
-    return TouchReward(env, model)
 
 
 def _with_embeddings(env: gym.Env, encoder: str | Path | None) -> gym.Env:

@@ -7,18 +7,27 @@ Without touch, and with towers that were trained together (a CLIP), a sentence i
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.features import FRONT, TRUTH_CONTACT, WRENCH
+from touchgoal.control.features import (
+    FRONT,
+    TACTILE,
+    TACTILE_LEFT,
+    TACTILE_RIGHT,
+    TRUTH_CONTACT,
+    WRENCH,
+)
+from touchgoal.encoders.preprocess import check_images
 from touchgoal.encoders.towers.goal_sentence import check_goal_sentence
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
@@ -67,18 +76,18 @@ class OwnFrame:
 
 
 @dataclass(frozen=True)
-class GoalPicture:
+class GoalImage:
     """An image of the goal as the measured camera would take it: a file, or RGB from a script."""
 
-    picture: Path | UInt8[np.ndarray, "h w 3"]
+    image: Path | UInt8[np.ndarray, "h w 3"]
     modalities: ClassVar[tuple[Modality, ...]] = ("image",)
 
     def __str__(self) -> str:
-        return f"image:{self.picture}" if isinstance(self.picture, Path) else "image: an array"
+        return f"image:{self.image}" if isinstance(self.image, Path) else "image: an array"
 
     def read(self) -> UInt8[np.ndarray, "1 h w 3"]:
         """Return the image, RGB; UserError: no such file, not an image, or too small."""
-        name, pixels = "the goal image", self.picture
+        name, pixels = "the goal image", self.image
         if isinstance(pixels, Path):
             name, path = f"goal image {pixels}", pixels
             if (pixels := read_picture(path)) is None:
@@ -97,12 +106,19 @@ class GoalPicture:
 class TouchArrays:
     """Tactile images of the goal, from a script."""
 
-    pictures: Mapping[str, UInt8[np.ndarray, "h w 3"]]  # by key of the fingertip, in the goal state
-    backgrounds: Mapping[str, UInt8[np.ndarray, "h w 3"]]  # the same fingertips untouched
+    images: Mapping[str, UInt8[np.ndarray, "h w 3"]]  # by key of the fingertip, in the goal state
+    # the same fingertips untouched; empty until the measured trajectory is known
+    backgrounds: Mapping[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)
     modalities: ClassVar[tuple[Modality, ...]] = ("tactile",)
 
     def __str__(self) -> str:
         return "touch: arrays"
+
+    def beside(self, frames: Mapping[str, np.ndarray]) -> "TouchArrays":
+        """Take the background from a trajectory's frames; UserError: it has other fingertips."""
+        if self.images.keys() != {key for key in TACTILE if key in frames}:
+            raise UserError("the goal's fingertips must be the trajectory's: left, right or both")
+        return replace(self, backgrounds={k: touch_background(frames[k]) for k in self.images})
 
 
 @dataclass(frozen=True)
@@ -173,7 +189,7 @@ class Sentence:
     """Description of how the object feels; UserError if it is negated or contradicts itself.
 
     With a baseline sentence, such as "an object", only the direction from it to the sentence counts
-    (VLM-RM, arXiv 2310.12921): see `distance.embedding_distance.text_distances`.
+    (VLM-RM, arXiv 2310.12921): see `distance.cost.text_distances`.
     """
 
     text: str
@@ -190,28 +206,33 @@ class Sentence:
 
 
 def content_checksum(spec: "GoalSpec") -> str:
-    """Return a text that changes when what a goal refers to does: its picture, episodes or file."""
+    """Return a text that changes when what a goal refers to does: its image, episodes or file."""
     if isinstance(spec, EpisodeEnd):
         return EpisodeSet(spec.root, keys=spec.keys).episode_checksum(spec.index)
     if isinstance(spec, Bank):
         return EpisodeSet(spec.root, keys=spec.keys).checksum
     if isinstance(spec, GoalFile):
         return hashlib.sha256(spec.path.read_bytes()).hexdigest()
-    if isinstance(spec, GoalPicture):
+    if isinstance(spec, GoalImage):
         return hashlib.sha256(spec.read().tobytes()).hexdigest()
     return str(spec)
 
 
-PictureGoal = OwnFrame | GoalPicture | EpisodeEnd | Bank | GoalFile | Sentence
+ImageGoal = OwnFrame | GoalImage | EpisodeEnd | Bank | GoalFile | Sentence
 TouchGoal = OwnFrame | TouchArrays | EpisodeEnd | Bank | GoalFile
-GoalSpec = PictureGoal | TouchGoal
+GoalSpec = ImageGoal | TouchGoal
+GoalLike = GoalSpec | str | int | np.ndarray | Mapping[str, np.ndarray]
+"""A goal in a script; see `touchgoal.Reward`."""
+
+SIDES = {"left": TACTILE_LEFT, "right": TACTILE_RIGHT}
+"""Names of the fingertips in a script, and their keys."""
 
 
 @dataclass(frozen=True)
 class Goal:
     """The goal of each modality; None without one."""
 
-    image: PictureGoal | None = None
+    image: ImageGoal | None = None
     tactile: TouchGoal | None = None
     text: Sentence | None = None
 
@@ -245,7 +266,7 @@ def parse_goal(text: str, keys: Mapping[str, str] | None = None) -> GoalSpec:
     if kind == "frame" and re.fullmatch(r"\d+", value):
         return OwnFrame(int(value))
     if kind == "image" and value:
-        return GoalPicture(Path(value))
+        return GoalImage(Path(value))
     if kind == "episode" and episode:
         return EpisodeEnd(Path(episode[1]), int(episode[2]), keys or {})
     if kind == "bank" and value:
@@ -258,12 +279,43 @@ def parse_goal(text: str, keys: Mapping[str, str] | None = None) -> GoalSpec:
     raise UserError(f"goal '{text}' is not understood; write {FORMS}")
 
 
+def goals_of_script(goal: GoalLike | Sequence[GoalLike]) -> list[GoalSpec]:
+    """Return a script's goals, arrays or text; UserError: one is no goal."""
+    if isinstance(goal, GoalSpec):
+        return [goal]
+    if isinstance(goal, np.ndarray):
+        check_images("the goal", goal, ndim=(3,))
+        return [GoalImage(goal)]
+    if isinstance(goal, int):
+        if goal < 0:
+            raise UserError(f"goal {goal} is not a frame: count from 0, or give 'last'")
+        return [OwnFrame(goal)]
+    if isinstance(goal, str):
+        known = goal.strip() == "last" or re.match(
+            r"\s*(frame|image|episode|bank|goal|text):", goal
+        )
+        return [parse_goal(goal) if known else Sentence(goal)]
+    if isinstance(goal, Mapping):
+        return _goals_of_arrays(goal)
+    return [spec for one in goal for spec in goals_of_script(one)]
+
+
+def _goals_of_arrays(goal: Mapping[str, np.ndarray]) -> list[GoalSpec]:
+    for name, image in goal.items():
+        if name != "image" and name not in SIDES:
+            raise UserError(f"a goal has no '{name}': give image, left, right or several of them")
+        check_images(f"the goal's {name}", image, ndim=(3,))
+    touch = {SIDES[name]: image for name, image in goal.items() if name in SIDES}
+    specs: list[GoalSpec] = [GoalImage(goal["image"])] if "image" in goal else []
+    return [*specs, *([TouchArrays(touch)] if touch else [])]
+
+
 def assign_goals(
-    specs: Sequence[GoalSpec], available: Sequence[Modality], picture_words: bool = False
+    specs: Sequence[GoalSpec], available: Sequence[Modality], image_words: bool = False
 ) -> Goal:
     """Give each available modality the first goal that applies to it.
 
-    With `picture_words`, of towers that compare images with sentences, a sentence is a goal for
+    With `image_words`, of towers that compare images with sentences, a sentence is a goal for
     images where there is no touch. UserError: no goal, or one that no modality takes.
     """
     if not specs:
@@ -272,7 +324,7 @@ def assign_goals(
     for spec in specs:
         wanted = [m for m in spec.modalities if m in available]
         if isinstance(spec, Sentence) and not wanted:
-            if not picture_words:
+            if not image_words:
                 raise UserError(_no_words(spec))
             wanted = ["image"]
         if not wanted:
@@ -287,7 +339,10 @@ def assign_goals(
                 f"{' and '.join(wanted)}; put it first or leave it out"
             )
         taken |= dict.fromkeys(free, spec)
-    return Goal(**taken)  # pyright: ignore[reportArgumentType]  modalities fixes the types
+    image, touch, text = (taken.get(name) for name in MODALITIES)
+    assert isinstance(image, ImageGoal | None) and isinstance(touch, TouchGoal | None)
+    assert isinstance(text, Sentence | None)
+    return Goal(image, touch, text)
 
 
 def check_goal(goal: Goal, inputs: Inputs) -> None:
@@ -298,7 +353,7 @@ def check_goal(goal: Goal, inputs: Inputs) -> None:
     for spec in (goal.image, goal.tactile):
         if isinstance(spec, OwnFrame) and inputs.length is not None:
             frame_index(spec, inputs.length, inputs.name)
-    if isinstance(goal.image, GoalPicture):
+    if isinstance(goal.image, GoalImage):
         goal.image.read()
     if isinstance(goal.image, EpisodeEnd):
         goal.image.read([inputs.camera or FRONT])
@@ -318,6 +373,22 @@ def frame_index(spec: OwnFrame, length: int, source: str) -> int:
     if spec.index >= length:
         raise UserError(f"goal '{spec}' lies beyond {source}, whose frames are 0 to {length - 1}")
     return spec.index
+
+
+def check_words(specs: Iterable[GoalSpec], touch_knows_words: bool) -> None:
+    """Raise UserError if a goal is a sentence and the touch encoder was not aligned with texts."""
+    sentences = [spec for spec in specs if isinstance(spec, Sentence)]
+    if sentences and not touch_knows_words:
+        raise UserError(
+            f"goal '{sentences[0]}': this touch encoder was not aligned with texts: leave the goal "
+            "out, or take an encoder of train-encoder align"
+        )
+
+
+def missing_camera(source: str, camera: str, cameras: Sequence[str]) -> str:
+    """Return the message for a source that lacks a camera."""
+    there = f"choose --camera {' or '.join(cameras)}" if cameras else "it has no camera"
+    return f"{source} has no images of {camera}: {there}"
 
 
 def _no_words(spec: Sentence) -> str:

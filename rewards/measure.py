@@ -1,4 +1,7 @@
-"""Measure every trajectory of a source; broken ones are skipped, measured ones are not repeated."""
+"""Measure every trajectory of a source, one after the other here or side by side on Ray.
+
+Broken ones are skipped, measured ones are not repeated.
+"""
 
 import csv
 import hashlib
@@ -6,23 +9,54 @@ import io
 import json
 import resource
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 
 from touchgoal.encoders.training.checkpoint import checksum
-from touchgoal.rewards.embed_trajectories import Count, Embedded
-from touchgoal.rewards.goals import GoalSpec, content_checksum
+from touchgoal.episodes.schema import Episode
+from touchgoal.rewards.features.embedded import EmbeddedEpisode
+from touchgoal.rewards.features.embedder import EpisodeEmbedder
+from touchgoal.rewards.features.embedding_cache import embed_trajectory, kept_file
+from touchgoal.rewards.goals import GoalSpec, Inputs, content_checksum
 from touchgoal.rewards.report.record import record_of
 from touchgoal.rewards.report.report import write_report
-from touchgoal.rewards.reward_model import RewardModel
-from touchgoal.rewards.sources.trajectory import Skipped, Trajectory
+from touchgoal.rewards.report.thumbnails import Thumbnails
+from touchgoal.rewards.reward import PreparedReward, Reward
+from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
+from touchgoal.rewards.sources.trajectory import Skipped, Trajectory, read_ahead
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import progress_bar
 from touchgoal.runtime.version import __version__
 
 SKIPPED = "skipped.csv"
 _RECORDS = "measured"
+Count = Callable[[int], object]
+"""Callback with the number of frames done."""
+
+
+@dataclass(frozen=True)
+class EncoderOptions:
+    """Options by which a node of a cluster loads the encoders; see `Reward`."""
+
+    inputs: Inputs
+    encoder: str | None
+    towers: str | None
+    parts: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Embedded:
+    """A trajectory that was read and embedded."""
+
+    trajectory: Trajectory
+    embedded: EmbeddedEpisode
+    thumbnails: Thumbnails
+
+
 Embed = Callable[[Sequence[Trajectory], Count], Iterator[Embedded | Skipped]]
 """Embeds trajectories in their order."""
 
@@ -33,19 +67,17 @@ class Measurement:
     def __init__(
         self,
         trajectories: Sequence[Trajectory],
-        model_of: Callable[[Trajectory], RewardModel],
+        rewards: Mapping[str, PreparedReward],
         out: Path,
-        gamma: float,
         plots: int,
     ) -> None:
         """Find out what is measured already.
 
         Args:
-            gamma: discount factor of the potential-based reward.
+            rewards: the reward of each trajectory, by name.
             plots: number of trajectories, from the first, that get a plot.
         """
-        self._out, self._gamma = out, gamma
-        self._models = {t.name: model_of(t) for t in trajectories}
+        self._out, self._rewards = out, rewards
         self._contents: dict[str, str] = {}
         self._plotted = {t.name for t in trajectories[:plots]}
         self._paths = {t.name: self._path(t) for t in trajectories}
@@ -84,14 +116,13 @@ class Measurement:
             self.skipped.append(result)
             return
         trajectory, name = result.trajectory, result.trajectory.name
-        model = self._models[name]
-        curves = model.curves(result.embedded)
-        plot = name in self._plotted
-        write_report(curves, self._out, name, model.provenance(), self._gamma, plot)
+        reward = self._rewards[name]
+        curves = reward.curves(result.embedded)
+        write_report(curves, self._out, name, reward.provenance(), name in self._plotted)
         path = self._paths[name]
         for stale in path.parent.glob(f"{name}.*.npz"):
             stale.unlink()
-        record_of(curves, trajectory, result.thumbnails, self._gamma).save(path)
+        record_of(curves, trajectory, result.thumbnails).save(path)
 
     def _content(self, spec: GoalSpec) -> str:
         """Return the checksum of a goal's content, read once: thousands of trajectories share it."""
@@ -102,19 +133,70 @@ class Measurement:
 
     def _path(self, trajectory: Trajectory) -> Path:
         """Return the path of a record, which names the recording and what it was measured with."""
-        model = self._models[trajectory.name]
+        reward = self._rewards[trajectory.name]
         made_of = [
             __version__,
             trajectory.checksum(),
-            model.provenance(),
-            model.goal.as_dict(),
-            [self._content(spec) for spec in model.goal.specs],
-            repr(model.normalizer),
-            checksum(*(model.value.state_dict().values() if model.value else ())),
-            self._gamma,
+            reward.provenance(),
+            reward.plain,
+            reward.goal.as_dict(),
+            [self._content(spec) for spec in reward.goal.specs],
+            repr(reward.normalizer),
+            checksum(*(reward.value.state_dict().values() if reward.value else ())),
         ]
         digest = hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:12]
         return self._out / _RECORDS / f"{trajectory.name}.{digest}.npz"
+
+
+def embed_here(
+    trajectories: Sequence[Trajectory], count: Count, embedder: EpisodeEmbedder
+) -> Iterator[Embedded | Skipped]:
+    """Embed in this process, while threads read ahead what is not embedded yet."""
+    kept = {t.name for t in trajectories if (p := kept_file(embedder, t)) and p.is_file()}
+    reading = read_ahead(t for t in trajectories if t.name not in kept)
+    for trajectory in trajectories:
+        chunks = () if trajectory.name in kept else _counted(next(reading), count)
+        yield _embed(embedder, trajectory, chunks)
+
+
+def embed_on_ray(
+    trajectories: Sequence[Trajectory], count: Count, options: EncoderOptions, address: str
+) -> Iterator[Embedded | Skipped]:
+    """Embed each trajectory on a core of a Ray cluster, whose nodes read the same files."""
+    with parallel_map(partial(_embed_apart, options), trajectories, address) as results:
+        for trajectory, result in zip(trajectories, results, strict=True):
+            count(trajectory.length)
+            yield result
+
+
+def _embed_apart(options: EncoderOptions, trajectory: Trajectory) -> Embedded | Skipped:
+    return _embed(_load(options), trajectory, trajectory.chunks())
+
+
+@lru_cache(maxsize=1)  # a worker embeds many trajectories
+def _load(options: EncoderOptions) -> EpisodeEmbedder:
+    reward = Reward(encoder=options.encoder, towers=options.towers)
+    return reward.embedder(options.inputs, options.parts)
+
+
+def _embed(
+    embedder: EpisodeEmbedder, trajectory: Trajectory, chunks: Iterable[Episode]
+) -> Embedded | Skipped:
+    thumbnails = Thumbnails(trajectory.length)
+    try:
+        embedded = embed_trajectory(embedder, trajectory, thumbnails.collect(chunks))
+        if not thumbnails.shown and isinstance(trajectory, EpisodeTrajectory):  # it was embedded
+            thumbnails.add(trajectory.read(thumbnails.planned))
+    except UserError as error:
+        return Skipped(trajectory.name, str(error))
+    return Embedded(trajectory, embedded, thumbnails)
+
+
+def _counted(chunks: Iterable[Episode], count: Count) -> Iterator[Episode]:
+    """Count the frames of a chunk as done when the next one is asked for."""
+    for chunk in chunks:
+        yield chunk
+        count(len(chunk))
 
 
 def write_skipped(skipped: Sequence[Skipped], total: int, out: Path) -> str:

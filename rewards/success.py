@@ -10,13 +10,20 @@ value cost too little.
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
-from touchgoal.rewards.distance.parts import FUSED
+from touchgoal.episodes.outcomes.generate import MADE, made_failures
+from touchgoal.episodes.schema import Episode
+from touchgoal.rewards.curves import FUSED
+from touchgoal.rewards.distance.cost import compute_curves
+from touchgoal.rewards.distance.normalizer import DistanceNormalizer
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.features.successful_ends import SuccessfulEnds
+from touchgoal.rewards.value import Value
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
@@ -73,6 +80,53 @@ def check_demonstrations(demonstrations: int, rejected: float = REJECTED) -> Non
             f"to reject at most {rejected:.0%} of successes, a threshold needs at least {needed} "
             f"demonstrations (10 % needs 9, 5 % needs 19); there are {demonstrations}"
         )
+
+
+def last_costs(
+    episodes: Sequence[EmbeddedEpisode],
+    ends: SuccessfulEnds,
+    normalizer: DistanceNormalizer,
+    value: Value | None,
+) -> list[float]:
+    """Return the last fused cost of each episode to the ends of successes with its object.
+
+    UserError: there is no end with its object, or the normalizer has no units to fuse parts by.
+    """
+    costs = []
+    for episode in episodes:
+        goal = EmbeddedGoal(ends.for_trajectory(episode, "the successes that are fitted"))
+        curves = compute_curves(episode, goal, normalizer, value).costs
+        if FUSED not in curves:
+            raise UserError(
+                "a success threshold needs the parts of a cost: two fitted successes must share an "
+                "object"
+            )
+        costs.append(float(curves[FUSED][-1]))
+    return costs
+
+
+def accepted_failures(
+    threshold: SuccessThreshold,
+    successes: Sequence[Episode],
+    last_cost: Callable[[Episode], float],
+) -> dict[str, tuple[int, int]]:
+    """Return how many failures made from successes pass a threshold, of how many, by kind.
+
+    The kind "wrong_object" takes its touch from the next success with another object; without one it
+    is not made. A failure whose images `last_cost` refuses (UserError) does not pass.
+    """
+    passed: dict[str, list[bool]] = {kind: [] for kind in MADE}
+    for k, success in enumerate(successes):
+        later = [*successes[k + 1 :], *successes[:k]]
+        others = [e for e in later if e.meta.get("object") != success.meta.get("object")]
+        for kind, failure in made_failures(success, (others or [success])[0]).items():
+            if kind == "wrong_object" and not others:
+                continue
+            try:
+                passed[kind].append(threshold.accepts(last_cost(failure)))
+            except UserError:
+                passed[kind].append(False)
+    return {kind: (sum(accepted), len(accepted)) for kind, accepted in passed.items() if accepted}
 
 
 def load_success_threshold(normalizer: str | Path | None) -> SuccessThreshold | None:

@@ -18,33 +18,32 @@ UNTOUCHED = np.eye(8)[-1]
 def episode(k: int, success: bool = True, n: int = 80) -> EmbeddedEpisode:
     """Touches at half of its length, unless it fails; the camera sees a noisy way to the goal."""
     name, contact = k % len(NAMES), n // 2
-    touch = np.tile(UNTOUCHED, (2, n, 1))
+    touch = np.tile(UNTOUCHED, (n, 2, 1))
     if success:
-        touch[:, contact:] = FELT[name]
+        touch[contact:] = FELT[name]
     touch += RNG.normal(0, 0.05, touch.shape)
     seen = np.stack([np.linspace(0, 1, n) + RNG.normal(0, 0.3, n), np.ones(n)], axis=1)
     return EmbeddedEpisode(
+        {"image": seen.astype(np.float32), "touch": touch.astype(np.float32)},
+        EmbeddingSource("offline", "front"),
         f"made up #{k}",
         20.0,
+        ("left", "right"),
         Contact(contact if success else None, "truth"),
-        EmbeddingSource("offline", "front"),
-        image=seen.astype(np.float32),
-        sides=("left", "right"),
-        touch=touch.astype(np.float32),
         object=NAMES[name],
         success=success,
     )
 
 
 def goal(e: EmbeddedEpisode) -> EmbeddedGoal:
-    touch = np.tile(FELT[NAMES.index(e.object)], (2, 1, 1)).astype(np.float32)
-    return EmbeddedGoal({}, frozenset(), touch=touch)
+    touch = np.tile(FELT[NAMES.index(e.object)], (1, 2, 1)).astype(np.float32)
+    return EmbeddedGoal({"touch": touch})
 
 
 def measure(e: EmbeddedEpisode, to: EmbeddedGoal) -> Curves:
-    assert to.touch is not None
-    touch_cost = 1 - (e.touches() * to.touch).sum(-1).mean(0).astype(float)
-    costs = {"fused": 0.5 * (1 - e.pictures()[:, 0]) + 0.5 * touch_cost}
+    image, touch = e.features["image"], e.features["touch"]
+    touch_cost = 1 - (touch * to.features["touch"]).sum(-1).mean(1).astype(float)
+    costs = {"fused": 0.5 * (1 - image[:, 0]) + 0.5 * touch_cost}
     return Curves(e.source, {}, e.fps, e.contact, costs, {})
 
 
@@ -60,6 +59,8 @@ def test_the_verdict_is_yes_where_touch_tells_and_no_where_it_was_shuffled() -> 
     assert rows["AUC", "neutral"].high < -0.1
     same = rows["last cost", "mirrored"]  # both fingertips feel the same here
     assert same.low <= 0 <= same.high
-    shuffled = [replace(e, touch=e.touches()[:, RNG.permutation(len(e))]) for e in episodes]
+    touches = [e.features["touch"][RNG.permutation(len(e))] for e in episodes]
+    pairs = zip(episodes, touches, strict=True)
+    shuffled = [replace(e, features={**e.features, "touch": touch}) for e, touch in pairs]
     audit = audit_touch(shuffled, goals, measure)
     assert not audit.mattered and "no sign that touch mattered" in audit.table

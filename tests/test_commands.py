@@ -67,17 +67,22 @@ def test_collected_episodes_are_sound(episodes: Path, capsys: pytest.CaptureFixt
 
 def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
     out = tmp_path / "curves"
-    run("reward-curves", episodes, "--goal", f"episode:{episodes}#1", "--goal",
-        "text:a hard smooth round object", "--index", 0, "--out", out)  # fmt: skip
-    picture = cv2.imread(str(out / "episode_000.png"))
-    assert picture is not None and picture.shape == (1000, 1200, 3)
-    report = json.loads((out / "episode_000.json").read_text())
-    plain = {"image", "tactile", "text", "image+tactile", "image+text"}
-    parts = "front wrist wrist_map object force centre held slip words wrench value".split()
-    assert set(report["metrics"]) == {*plain, *parts, "fused"}
+    goals = "--goal", f"episode:{episodes}#1", "--goal", "text:a hard smooth round object"
+    run("reward-curves", episodes, *goals, "--index", 0, "--out", out)
+    run("reward-curves", episodes, *goals, "--index", 0, "--plain", "--out", tmp_path / "plain")
+    image = cv2.imread(str(out / "episode_000.png"))
+    assert image is not None and image.shape == (1000, 1200, 3)
+    report, plain = (
+        json.loads((folder / "episode_000.json").read_text())["metrics"]
+        for folder in (out, tmp_path / "plain")
+    )
+    parts = "front wrist wrist_map object force centre held slip words wrench value fused"
+    assert set(report) == set(parts.split())
+    assert set(plain) == {"image", "tactile", "text", "image+tactile", "image+text"}
     rows = (out / "episode_000.csv").read_text().splitlines()
     assert len(rows) == 1 + EpisodeSet(episodes).lengths[0]
-    assert report["metrics"]["tactile"]["end"] < 0.3 < 0.9 < report["metrics"]["tactile"]["start"]
+    for touch in (report["object"], plain["tactile"]):
+        assert touch["end"] < 0.3 < 0.9 < touch["start"]
     assert json.loads((out / "metrics.json").read_text())[0]["source"] == "episodes#0"
 
 
@@ -90,7 +95,7 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     frames, fps = read_frames(tmp_path / "episode.mp4")
     assert frames.shape[1:] == (264, 720, 3) and fps == 10
     printed = capsys.readouterr().out
-    assert "image+tactile" in printed and str(tmp_path / "curves.png") in printed
+    assert "fused" in printed and str(tmp_path / "curves.png") in printed
 
 
 def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -208,7 +213,7 @@ def few_objects(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording, "HELD_OUT_OBJECTS", ("brick", "toy_brick"))
     monkeypatch.setattr(mixed_demonstrations, "HELD_OUT_OBJECTS", ("brick", "toy_brick"))
     monkeypatch.setattr(recording, "TRAINING_OBJECTS", ("candle", "soda_can"))
-    monkeypatch.setattr("touchgoal.rewards.value.fit_value._STEPS", 5)
+    monkeypatch.setattr("touchgoal.rewards.value._STEPS", 5)
 
 
 @pytest.mark.slow

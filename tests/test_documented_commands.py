@@ -168,7 +168,7 @@ def _the_job_is_done(desk: Path, cell_file: Path, shell: Shell) -> None:
     assert worst["excess"] == 0 and worst["speed"] < 1
     assert shell(["reward-curves", str(run / "episodes"), "--out", str(run / "curves")]) == 0
     report = json.loads((run / "curves" / "episode_000.json").read_text())
-    assert report["metrics"]["tactile"]["end"] < report["metrics"]["tactile"]["start"]
+    assert report["metrics"]["object"]["end"] < report["metrics"]["object"]["start"]
 
 
 @contextmanager

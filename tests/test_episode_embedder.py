@@ -1,4 +1,4 @@
-"""Episodes and goals through tiny encoders: pictures, touch and words become curves."""
+"""Episodes and goals through tiny encoders: images, touch and words become curves."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,14 +16,15 @@ from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBack
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.rewards.distance.embedding_distance import compute_curves
-from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
+from touchgoal.rewards.distance.cost import compute_curves
+from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import (
-    GoalPicture,
+    GoalImage,
     Modality,
     OwnFrame,
     Sentence,
     assign_goals,
+    check_words,
     parse_goal,
 )
 from touchgoal.runtime.errors import UserError
@@ -32,7 +33,7 @@ ALL: tuple[Modality, ...] = ("image", "tactile", "text")
 
 
 def recorded(n: int = 12, contact: int = 7, color: int = 200) -> Episode:
-    """A square that crosses the front picture; a bright blob on both gels from contact on."""
+    """A square that crosses the front image; a bright blob on both gels from contact on."""
     rng = np.random.default_rng(0)
     front = np.full((n, 32, 32, 3), 60, np.uint8)
     gel = rng.integers(90, 110, (240, 320, 3), dtype=np.uint8)
@@ -55,7 +56,7 @@ def embedder() -> EpisodeEmbedder:
     return EpisodeEmbedder(towers, encoder)
 
 
-def test_goals_from_pictures_and_other_episodes(embedder: EpisodeEmbedder, tmp_path: Path) -> None:
+def test_goals_from_images_and_other_episodes(embedder: EpisodeEmbedder, tmp_path: Path) -> None:
     writer = EpisodeWriter(tmp_path / "set")
     writer.append(recorded(color=160))
     writer.append(recorded())
@@ -64,17 +65,16 @@ def test_goals_from_pictures_and_other_episodes(embedder: EpisodeEmbedder, tmp_p
     mine = embedder.embed_episode(recorded(color=160), 20.0, "mine")
     spec = parse_goal(f"episode:{tmp_path / 'set'}#1")
     end = embedder.embed_goal(assign_goals([spec], ALL), mine)
-    assert other.touch is not None and end.touch is not None and end.image is not None
-    assert end.image[0] == pytest.approx(other.pictures()[-1], abs=1e-5)
-    assert end.touch == pytest.approx(other.touch[:, -1:], abs=1e-5)
+    for name in ("image", "touch"):
+        assert end.features[name] == pytest.approx(other.features[name][-1:], abs=1e-5)
 
     Image.fromarray(stored.frames[FRONT][-1]).save(tmp_path / "end.png")
-    picture = embedder.embed_goal(assign_goals([GoalPicture(tmp_path / "end.png")], ALL), mine)
-    assert picture.touch is None and picture.image is not None
-    assert picture.image[0] == pytest.approx(other.pictures()[-1], abs=1e-5)
-    (tmp_path / "end.png").write_text("no picture")
+    end = embedder.embed_goal(assign_goals([GoalImage(tmp_path / "end.png")], ALL), mine)
+    assert "touch" not in end.features
+    assert end.features["image"] == pytest.approx(other.features["image"][-1:], abs=1e-5)
+    (tmp_path / "end.png").write_text("no image")
     with pytest.raises(UserError, match=r"end\.png cannot be read"):
-        GoalPicture(tmp_path / "end.png").read()
+        GoalImage(tmp_path / "end.png").read()
 
 
 def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
@@ -86,6 +86,7 @@ def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
         embedder.embed_episode(recorded(contact=2), 20.0, "mine")
     touch_alone = {k: v for k, v in recorded().frames.items() if k != FRONT}
     touched = embedder.embed_episode(replace(recorded(), frames=touch_alone), 20.0, "mine")
+    touched = embedder.describe(touched, recorded().meta)
     assert touched.modalities == ("tactile", "text") and len(touched) == 12
 
 
@@ -98,14 +99,14 @@ def test_encoders_without_words_measure_touch() -> None:
         PooledEncoder(PooledEncoderConfig.for_sensor("gelsight_mini")),
     ):
         embedder = EpisodeEmbedder(PaintTowers(), encoder)
-        e = embedder.embed_episode(recorded(), 20.0, "mine", descriptions=True)
-        assert e.modalities == ("image", "tactile") and e.descriptions is None
+        e = embedder.embed_episode(recorded(), 20.0, "mine")
+        assert embedder.describe(e, recorded().meta).modalities == ("image", "tactile")
         cost = compute_curves(e, embedder.embed_goal(goal, e), None).raw["tactile"]
         assert cost[7:] == pytest.approx(np.zeros(5), abs=1e-3)
         assert cost[0] > 0.02 and np.ptp(cost[:7]) < 1e-6
         assert e.made_with.sensor == "gelsight_mini" and e.made_with.encoder
         with pytest.raises(UserError, match="was not aligned with texts"):
-            check_words([Sentence("hard")], encoder)
+            check_words([Sentence("hard")], embedder.knows_words)
 
 
 def test_an_episode_embedded_in_chunks_is_the_whole(embedder: EpisodeEmbedder) -> None:
@@ -116,6 +117,6 @@ def test_an_episode_embedded_in_chunks_is_the_whole(embedder: EpisodeEmbedder) -
     ]
     once = embedder.embed_episode(whole, 20.0, "x")
     joined = embedder.embed_chunks(chunks, 20.0, "x")
-    assert joined.pictures() == pytest.approx(once.pictures(), abs=1e-6)
-    assert joined.touches() == pytest.approx(once.touches(), abs=1e-5)
+    for name, values in once.features.items():
+        assert joined.features[name] == pytest.approx(values, abs=1e-5), name
     assert (joined.contact, len(joined)) == (once.contact, 20)

@@ -166,7 +166,7 @@ def test_commands_and_curves_refuse_exchanged_colours(tmp_path: Path) -> None:
         with pytest.raises(SystemExit, match="red and blue are exchanged"):
             main(command)
     with pytest.raises(UserError, match="red and blue are exchanged"):
-        touchgoal.reward_curve(tactile={"left": np.stack(swapped)})
+        touchgoal.Reward("last")(tactile={"left": np.stack(swapped)})
 
 
 def test_a_set_in_which_the_fingertips_change_places_is_refused(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
-"""Curves from arrays in one call, and what is checked before any encoder is loaded."""
+"""One object measures arrays, sets and runs; what is checked before any encoder is loaded."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,25 +21,27 @@ from touchgoal.control.features import (
     TRUTH_CONTACT,
     TRUTH_START,
 )
+from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.encoders.pretrained import save
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.store import EpisodeWriter
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
-from touchgoal.rewards.api import reward_curve
-from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
-from touchgoal.rewards.goals import GoalPicture, GoalSpec, Inputs, OwnFrame, Sentence, assign_goals
-from touchgoal.rewards.online.cost_meter import CostMeter, OnlineCost, load_cell_cost
-from touchgoal.rewards.reward_model import RewardModel, load_reward_model
+from touchgoal.rewards.goals import GoalImage, Inputs, Sentence, assign_goals
+from touchgoal.rewards.online import CostMeter, OnlineCost, load_cell_cost
+from touchgoal.rewards.report.plot import plot
+from touchgoal.rewards.reward import Reward
 from touchgoal.runtime.errors import UserError
 
 EPISODE = recorded()
 IMAGES = EPISODE.frames[FRONT]
+STORED = json.loads((Path(__file__).parent / "reward_costs.json").read_text())
 TOUCH = {"left": EPISODE.frames[TACTILE_LEFT], "right": EPISODE.frames[TACTILE_RIGHT]}
 
 
@@ -53,21 +54,37 @@ def encoder() -> TouchEncoder:
 
 def test_curve_of_arrays(encoder: TouchEncoder) -> None:
     both = {"encoder": encoder, "towers": PaintTowers()}
-    curves = reward_curve(IMAGES, TOUCH, ("last", "a hard ball"), **both)
+    curves = Reward(("last", "a hard ball"), **both)(images=IMAGES, tactile=TOUCH)
     assert curves.costs.keys() == {"image", "tactile", "text"}
     for name, cost in curves.costs.items():
         assert cost.shape == (12,) and curves.rewards[name] == pytest.approx(-cost)
         assert curves.potential_rewards(0.9)[name].shape == (12,)
     for name in ("image", "tactile"):
         assert curves.costs[name][0] > 1e-4 and curves.costs[name][-1] == pytest.approx(0, abs=1e-6)
-    third = reward_curve(IMAGES, TOUCH, 3, **both)
+    third = Reward(3, **both)(images=IMAGES, tactile=TOUCH)
     assert third.costs["image"].argmin() == 3 and third.same_episode == {"image", "tactile"}
+
+
+def test_one_reward_loads_one_encoder(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over arrays, a set, and an episode of it."""
+    pytest.importorskip("transformers")
+    load, loaded = pretrained.load_encoder, []
+    monkeypatch.setattr(pretrained, "load_encoder", lambda *a: loaded.append(a) or load(*a))
+    reward = Reward(f"bank:{run_folder / 'episodes'}", normalizer="none")
+    curves = reward(images=IMAGES, tactile=TOUCH)
+    assert curves.costs.keys() == {"image", "tactile"}
+    episodes = EpisodeSet(run_folder / "episodes")
+    of_set = reward(episodes)
+    assert [len(c) for c in of_set] == [12, 12, 12]
+    one = reward(episodes.read(2)).costs["tactile"]
+    assert one == pytest.approx(of_set[2].costs["tactile"], abs=1e-6)
+    assert len(loaded) == 1
 
 
 @pytest.mark.gpu
 def test_a_gpu_gives_the_same_curves() -> None:
     on_cpu, on_gpu = (
-        reward_curve(IMAGES, TOUCH, ("last", "a hard ball"), device=device).costs
+        Reward(("last", "a hard ball"), device=device)(images=IMAGES, tactile=TOUCH).costs
         for device in ("cpu", "cuda")
     )
     for name, cost in on_cpu.items():
@@ -76,32 +93,34 @@ def test_a_gpu_gives_the_same_curves() -> None:
 
 def test_goals_as_arrays_are_those_of_the_same_frame(encoder: TouchEncoder) -> None:
     both = {"encoder": encoder, "towers": PaintTowers()}
-    frame = reward_curve(IMAGES, TOUCH, 9, **both)
-    arrays = {"image": IMAGES[9], **{side: pictures[9] for side, pictures in TOUCH.items()}}
-    given = reward_curve(IMAGES, TOUCH, arrays, **both)
+    frame = Reward(9, **both)(images=IMAGES, tactile=TOUCH)
+    arrays = {"image": IMAGES[9], **{side: images[9] for side, images in TOUCH.items()}}
+    given = Reward(arrays, **both)(images=IMAGES, tactile=TOUCH)
     for name in ("image", "tactile"):
         assert given.costs[name] == pytest.approx(frame.costs[name], abs=1e-6)
     assert not given.same_episode
-    picture = reward_curve(IMAGES, goal=IMAGES[9], towers=PaintTowers())
-    assert picture.costs["image"] == pytest.approx(frame.costs["image"], abs=1e-6)
-    touch = reward_curve(None, {"left": TOUCH["left"]}, "last", **both)
+    image = Reward(IMAGES[9], towers=PaintTowers())(images=IMAGES)
+    assert image.costs["image"] == pytest.approx(frame.costs["image"], abs=1e-6)
+    touch = Reward("last", **both)(tactile={"left": TOUCH["left"]})
     assert touch.costs.keys() == {"tactile"}
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("options", "arrays", "message"),
     [
-        (lambda: reward_curve(), "nothing to measure"),
-        (lambda: reward_curve(IMAGES / 255), "images must be RGB .* not of float64"),
-        (lambda: reward_curve(IMAGES[:1]), "at least 2 frames"),
-        (lambda: reward_curve(IMAGES, {"left": IMAGES[:3]}), "images 12, left 3"),
-        (lambda: reward_curve(IMAGES, goal={"left": IMAGES[0]}), "must be the trajectory's"),
-        (lambda: reward_curve(IMAGES, TOUCH, encoder="nobody"), "no touch encoder 'nobody'"),
+        ({}, {}, "nothing to measure"),
+        ({}, {"images": IMAGES / 255}, "images must be RGB .* not of float64"),
+        ({}, {"images": IMAGES[:1]}, "at least 2 frames"),
+        ({}, {"images": IMAGES, "tactile": {"left": IMAGES[:3]}}, "images 12, left 3"),
+        ({"goal": {"left": IMAGES[0]}}, {"images": IMAGES}, "must be the trajectory's"),
+        ({"encoder": "nobody"}, {"tactile": TOUCH}, "no touch encoder 'nobody'"),
     ],
 )
-def test_a_mistake_is_one_line(call: Callable[[], Any], message: str) -> None:
+def test_a_mistake_is_one_line(
+    options: dict[str, Any], arrays: dict[str, Any], message: str
+) -> None:
     with pytest.raises(UserError, match=message) as error:
-        call()
+        Reward(**options)(**arrays)
     assert "\n" not in str(error.value)
 
 
@@ -151,7 +170,7 @@ def test_mistakes_are_found_before_any_encoder_is_loaded(
 
     monkeypatch.chdir(run_folder)
     monkeypatch.setattr("touchgoal.encoders.pretrained.load_encoder", loaded)
-    monkeypatch.setattr("touchgoal.rewards.reward_model.load_towers", loaded)
+    monkeypatch.setattr("touchgoal.rewards.reward.load_towers", loaded)
     with pytest.raises(SystemExit, match=message):
         main(["reward-curves", *arguments, "--out", "out"])
     assert not (run_folder / "out").exists()
@@ -184,64 +203,75 @@ def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
     main(["reward-curves", "0.mp4", "--normalizer", "videos/normalizer.json", "--out", "scaled"])
     scaled = json.loads(Path("scaled/0.json").read_text())
     assert scaled["unit"] == "distance to goal (normalised)"
-    assert scaled["metrics"]["image"]["start"] == pytest.approx(1, abs=0.2)
+    assert scaled["metrics"]["fused"]["start"] == pytest.approx(1, abs=0.2)
 
 
-def test_python_and_command_agree(here: Path) -> None:
-    """The command normalises by the encoder's normalizer; so does Python when it is named."""
+def test_costs_are_those_on_record(
+    run_folder: Path, here: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Images, touch and words, raw and as parts, by the command and in Python.
+
+    The command normalises by the encoder's normalizer; so does Python when it is named.
+    """
     pytest.importorskip("transformers")
     truth = {TRUTH_START: np.zeros((12, 7), np.float32)}
     meta = {"sensor": "gelsight_mini", "success": True, "object": "cup"}
     episode = replace(EPISODE, frames={**EPISODE.frames, **truth}, meta=meta)
     EpisodeWriter(here / "set").append(episode)
-    main(["reward-curves", "set", "--out", "command"])
-    report = json.loads(Path("command/episode_000.json").read_text())
-    curves = reward_curve(IMAGES, TOUCH, normalizer="encoder")
-    assert curves.unit == report["unit"] == "distance to goal (normalised)"
-    for name, cost in curves.costs.items():
-        assert cost == pytest.approx(report["cost"]["values"][name], abs=1e-5)
-    raw = reward_curve(IMAGES, TOUCH)
-    assert "raw cosine distances, for" in repr(raw) and "the scene here is unknown" in raw.note
-    raw.plot().savefig("curves.png")
-    assert Path("curves.png").stat().st_size > 10_000 and "\n" not in repr(curves)
+    goals = "--index", "0", "--goal", "last", "--goal", "text:a hard ball"
+    main(["reward-curves", str(run_folder / "episodes"), *goals, "--out", "raw"])
+    assert "the scene here is recorded, not simulated" in capsys.readouterr().out
+    main(["reward-curves", "set", *goals, "--out", "parts"])
+    main(["reward-curves", "set", *goals, "--plain", "--out", "plain"])
+    raw, parts, plain = (
+        json.loads(Path(out, "episode_000.json").read_text())["cost"]["values"]
+        for out in ("raw", "parts", "plain")
+    )
+    curves = Reward(("last", "a hard ball"), normalizer="encoder")(images=IMAGES, tactile=TOUCH)
+    assert curves.unit == "distance to goal (normalised)" and "\n" not in repr(curves)
+    pairs = (raw, STORED["raw"]), (parts | plain, STORED["normalised"]), (curves.costs, parts)
+    for costs, expected in pairs:
+        assert costs.keys() == expected.keys()
+        for name, cost in costs.items():
+            assert cost == pytest.approx(expected[name], abs=1e-3), name
+    plot(curves).savefig("curves.png")
+    assert Path("curves.png").stat().st_size > 10_000
 
 
-def test_cost_during_a_run_is_raw_without_normalizer(encoder: TouchEncoder, tmp_path: Path) -> None:
-    Image.fromarray(IMAGES[9]).save(tmp_path / "end.png")
-    picture, words = GoalPicture(tmp_path / "end.png"), Sentence("soft")
+def test_cost_during_a_run_is_raw_without_normalizer(encoder: TouchEncoder) -> None:
     tick = {FRONT: IMAGES[0], TACTILE_LEFT: TOUCH["left"][0], TACTILE_RIGHT: TOUCH["right"][0]}
-    cost = OnlineCost(CostMeter(model_of(encoder, None, picture)))
-    expected = reward_curve(IMAGES, goal=IMAGES[9], towers=PaintTowers()).costs["image"][0]
+    cost = OnlineCost(meter_of(encoder, None, IMAGES[9]))
+    expected = Reward(IMAGES[9], towers=PaintTowers())(images=IMAGES).costs["image"][0]
     assert cost.latest_cost(tick) == pytest.approx(expected, abs=1e-6)
     cost.close()
     with pytest.raises(UserError, match="raw distances of several modalities"):
-        CostMeter(model_of(encoder, None, picture, words))
+        meter_of(encoder, None, IMAGES[9], "soft")
     with pytest.raises(UserError, match="not known before the end"):
-        CostMeter(model_of(encoder, None, OwnFrame()))
+        meter_of(encoder, None, "last")
 
 
-def model_of(
-    encoder: TouchEncoder, normalizer: DistanceNormalizer | None, *goals: GoalSpec
-) -> RewardModel:
+def meter_of(
+    encoder: TouchEncoder, normalizer: DistanceNormalizer | None, *goals: np.ndarray | str
+) -> CostMeter:
     inputs = Inputs("this run", FRONT, TACTILE, "gelsight_mini")
-    return load_reward_model(inputs, goals, encoder, PaintTowers(), normalizer)
+    reward = Reward(goals, encoder=encoder, towers=PaintTowers(), normalizer=normalizer)
+    return CostMeter(reward.prepare(inputs))
 
 
-def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_path: Path) -> None:
+def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder) -> None:
     """Same frames, same cost, from the fifth tick on; one fingertip flickers in the first ticks."""
-    Image.fromarray(IMAGES[9]).save(tmp_path / "end.png")
     noise = np.random.default_rng(1).integers(0, 30, (5, *TOUCH["left"].shape[1:]), dtype=np.uint8)
     left = np.concatenate([TOUCH["left"][:5] + noise, TOUCH["left"][5:]])
     embedder = EpisodeEmbedder(PaintTowers(), encoder)
     ends = {"image": 1.0, "text": 2.0}, {"image": 0.1, "text": 0.2}, {"front": 0.02}
     normalizer = DistanceNormalizer(*ends, {}, embedder.made_with, "recorded, not simulated", 3)
-    goals = [GoalPicture(tmp_path / "end.png"), Sentence("soft")]
+    goals = [GoalImage(IMAGES[9]), Sentence("soft")]
     frames = {FRONT: IMAGES, TACTILE_LEFT: left, TACTILE_RIGHT: TOUCH["right"]}
     recording = embedder.embed_episode(Episode(frames=frames, task="", meta={}), 20.0, "recording")
-    goal = embedder.embed_goal(assign_goals(goals, recording.modalities), recording)
+    goal = embedder.embed_goal(assign_goals(goals, ("image", "tactile", "text")), recording)
     expected = compute_curves(recording, goal, normalizer).parts["fused"]
     assert np.ptp(expected) > 0.05
-    meter = CostMeter(model_of(encoder, normalizer, *goals))
+    meter = meter_of(encoder, normalizer, IMAGES[9], "soft")
     ticks = [{key: values[i] for key, values in frames.items()} for i in range(len(IMAGES))]
     during = [meter.measure(tick, ticks[: min(i + 1, 5)]) for i, tick in enumerate(ticks)]
     np.testing.assert_allclose(during[4:], expected[4:], atol=1e-6)

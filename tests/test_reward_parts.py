@@ -11,7 +11,7 @@ from toy_towers import PaintTowers
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, WRIST
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.rewards.curves import Contact
-from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, fit_units
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.rewards.distance.parts import (
@@ -24,16 +24,19 @@ from touchgoal.rewards.distance.parts import (
     smooth,
     soft_minimum,
 )
-from touchgoal.rewards.features.contact_reading import ContactReader, ContactReadings
-from touchgoal.rewards.features.embedded import CameraFeatures, EmbeddedEpisode, goal_at_every_frame
-from touchgoal.rewards.features.slip import SlipMeter
+from touchgoal.rewards.features.contact_reading import ContactReader, SlipMeter
+from touchgoal.rewards.features.embedded import (
+    EmbeddedEpisode,
+    EmbeddedGoal,
+    Features,
+    last_rows,
+    take_rows,
+)
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
-from touchgoal.rewards.goals import Goal, GoalPicture, OwnFrame
-from touchgoal.rewards.online.failure_watch import FailureWatch
-from touchgoal.rewards.online.reward_wrapper import TouchReward, inputs_of
-from touchgoal.rewards.reward_model import load_reward_model
-from touchgoal.rewards.value.fit_value import fit_value
-from touchgoal.rewards.value.value import Value
+from touchgoal.rewards.online import FailureWatch
+from touchgoal.rewards.reward import Reward
+from touchgoal.rewards.reward_wrapper import RewardWrapper
+from touchgoal.rewards.value import Value, fit_value
 from touchgoal.runtime.errors import UserError
 
 N, GRASP = 40, 15
@@ -49,40 +52,39 @@ def embedded(
     rng = np.random.default_rng(seed)
     progress = np.linspace(0, 1 if success else 0.4, N)
 
-    def camera(width: int) -> CameraFeatures:
+    features: dict[str, np.ndarray] = {}
+    for name in ("front", "wrist"):
         maps = rng.normal(0, 0.1, (N, 4, 3, 3)).astype(np.float32)
         maps[:, 0, 1, 1] += 2 * progress - 1
         maps[:, 1] += 1
-        pooled = np.stack([np.cos(progress), np.sin(progress)], 1).astype(np.float32)
-        return CameraFeatures(pooled, maps.astype(np.float16))
-
-    held = np.repeat((np.arange(N) >= GRASP)[None], 2, axis=0)
-    noise = rng.normal(0, 0.1, (2, N)) * held
-    touch = np.stack([held + noise, held + 0 * noise], -1).astype(np.float32) / 2**0.5
-    readings = ContactReadings(
-        held,
-        (held * (force + rng.normal(0, 0.5, (2, N)))).astype(np.float32),
-        (held[..., None] * rng.normal(1e-3, 1e-4, (2, N, 2))).astype(np.float32),
-        (held * (slip * progress + rng.uniform(0, 1e-4, (2, N)))).astype(np.float32),
-    )
+        features[name] = np.stack([np.cos(progress), np.sin(progress)], 1).astype(np.float32)
+        features[f"{name}_map"] = maps.astype(np.float16)
+    held = np.repeat((np.arange(N) >= GRASP)[:, None], 2, axis=1)
     wrench = rng.normal(0, 0.3, (N, 6))
     wrench[:, 2] += pressed * progress
-    cameras = {FRONT: camera(2), WRIST: camera(2)}
+    noise = rng.normal(0, 0.1, (N, 2)) * held
+    numbers = {
+        "touch": np.stack([held + noise, held + 0 * noise], -1) / 2**0.5,
+        "force": held * (force + rng.normal(0, 0.5, (N, 2))),
+        "centre": held[..., None] * rng.normal(1e-3, 1e-4, (N, 2, 2)),
+        "slip": held * (slip * progress[:, None] + rng.uniform(0, 1e-4, (N, 2))),
+        "wrench": wrench,
+    }
+    features |= {name: values.astype(np.float32) for name, values in numbers.items()}
     return EmbeddedEpisode(
-        source=f"episode {seed}",
-        fps=20.0,
-        contact=Contact(GRASP, "detected"),
-        made_with=EmbeddingSource("offline", FRONT, "encoder", "gelsight_mini"),
-        image=cameras[FRONT].pooled,
-        sides=(TACTILE_LEFT, TACTILE_RIGHT),
-        touch=touch,
+        features | {"image": features["front"], "held": held},
+        EmbeddingSource("offline", FRONT, "encoder", "gelsight_mini"),
+        f"episode {seed}",
+        20.0,
+        (TACTILE_LEFT, TACTILE_RIGHT),
+        Contact(GRASP, "detected"),
         object="apple",
         success=success,
-        words=False,
-        cameras=cameras,
-        readings=readings,
-        wrench=wrench.astype(np.float32),
     )
+
+
+def end_of(episode: EmbeddedEpisode) -> EmbeddedGoal:
+    return EmbeddedGoal(last_rows([episode]))
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +105,7 @@ def value(successes: list[EmbeddedEpisode]) -> Value:
 def test_a_failure_of_each_part_raises_that_part(
     successes: list[EmbeddedEpisode], normalizer: DistanceNormalizer, value: Value
 ) -> None:
-    goal = goal_at_every_frame(successes[0].take(slice(-1, None)))
+    goal = end_of(successes[0])
     ends = (
         embedded(9),
         embedded(9, force=40.0),
@@ -129,11 +131,11 @@ def test_a_failure_of_each_part_raises_that_part(
 def test_before_contact_the_fingertips_cost_the_same_whatever_they_read(
     successes: list[EmbeddedEpisode], normalizer: DistanceNormalizer
 ) -> None:
-    goal = goal_at_every_frame(successes[0].take(slice(-1, None)))
+    goal = end_of(successes[0])
     parts = compute_curves(embedded(9), goal, normalizer).parts
     for name in ("object", "force", "centre", "held"):
         assert parts[name][:GRASP] == pytest.approx(np.ones(GRASP)), name
-    assert np.ptp(parts["fused"][:GRASP]) > 0.01  # the pictures lead
+    assert np.ptp(parts["fused"][:GRASP]) > 0.01  # the images lead
     costs, touching = np.array([0.2, 0.3]), np.array([False, True])
     assert gate(costs, touching, goal_touches=False) == pytest.approx([0, 0.3])
 
@@ -142,7 +144,7 @@ def test_pieces_of_a_trajectory_cost_the_same_as_the_whole(
     successes: list[EmbeddedEpisode], normalizer: DistanceNormalizer, value: Value
 ) -> None:
     """So costs are causal: a streamed frame knows no later one."""
-    goal = goal_at_every_frame(successes[0].take(slice(-1, None)))
+    goal = end_of(successes[0])
     whole = compute_curves(embedded(9), goal, normalizer, value).parts
     before: dict[str, float] = {}
     for t in range(N):
@@ -153,9 +155,10 @@ def test_pieces_of_a_trajectory_cost_the_same_as_the_whole(
 
 
 def test_distances_by_hand() -> None:
-    def readings(touching: list[bool], force: list[float], x: list[float]) -> ContactReadings:
-        centre = np.stack([x, np.zeros(len(x))], 1)[None].astype(np.float32)
-        return ContactReadings(np.array([touching]), np.array([force], np.float32), centre)
+    def readings(touching: list[bool], force: list[float], x: list[float]) -> Features:
+        centre = np.stack([x, np.zeros(len(x))], 1)[:, None].astype(np.float32)
+        numbers = np.array(force, np.float32)[:, None]
+        return {"held": np.array(touching)[:, None], "force": numbers, "centre": centre}
 
     light = readings([True, False], [9.5, 0], [3e-3, 0])
     d = contact_distances(light, readings([True], [39.5], [0]))
@@ -186,15 +189,14 @@ def test_a_grasp_slips_from_where_it_settled() -> None:
 
 def test_goals_that_differ_widen_the_unit(successes: list[EmbeddedEpisode]) -> None:
     """An object held elsewhere each time is not blamed for it; one goal alone says nothing."""
-    one = goal_at_every_frame(successes[0].take(slice(-1, None)))
-    assert goal_spread(one) == {}
-    ends = successes[0].take(slice(-3, None))
-    assert ends.readings is not None and ends.readings.centre is not None
-    centre = ends.readings.centre + np.array([0, 6e-3, 12e-3], np.float32)[:, None]
-    apart = goal_at_every_frame(replace(ends, readings=replace(ends.readings, centre=centre)))
+    one = end_of(successes[0])
+    assert goal_spread(one.features) == {}
+    ends = take_rows(successes[0].features, slice(-3, None))
+    centre = ends["centre"] + np.array([0, 6e-3, 12e-3], np.float32)[:, None, None]
+    apart = {**ends, "centre": centre}
     assert goal_spread(apart)["centre"] == pytest.approx(6e-3 * 2**0.5, rel=0.1)
-    units = {"centre": 2e-4}
-    costs = [part_costs(embedded(9), goal, units)["centre"][-1] for goal in (one, apart)]
+    mine, units = embedded(9).features, {"centre": 2e-4}
+    costs = [part_costs(mine, goal, units)["centre"][-1] for goal in (one.features, apart)]
     assert costs[1] < 0.1 < costs[0]
 
 
@@ -213,7 +215,7 @@ def test_a_value_is_refused_elsewhere(successes: list[EmbeddedEpisode], value: V
     assert "looks through" in str(value.mismatch(fitted[0], (FRONT,), "offline"))
     with pytest.raises(UserError, match="at least 4 successful episodes"):
         fit_value(successes[:3], "pour")
-    assert np.corrcoef(value.progress(embedded(9).cameras), np.arange(N))[0, 1] > 0.9
+    assert np.corrcoef(value.progress(embedded(9).features), np.arange(N))[0, 1] > 0.9
 
 
 def test_a_press_is_read_where_and_how_hard_it_is() -> None:
@@ -226,11 +228,10 @@ def test_a_press_is_read_where_and_how_hard_it_is() -> None:
     pressed[..., 0] += 60 * np.gradient(ball, axis=1) / np.abs(np.gradient(ball, axis=1)).max()
     frames = np.stack([gel] * 6 + [np.clip(pressed, 0, 255).astype(np.uint8)] * 3)
     readings = ContactReader(SENSORS["gelsight_mini"], frames[:5], 20.0).read(frames)
-    assert readings.touching[0].tolist() == [False] * 6 + [True] * 3
-    assert readings.force is not None and readings.centre is not None
-    assert readings.force[0, :6].tolist() == [0] * 6 and readings.force[0, -1] > 0
+    assert readings["held"].tolist() == [False] * 6 + [True] * 3 and len(readings["centre"]) == 9
+    assert readings["force"][:6].tolist() == [0] * 6 and readings["force"][-1] > 0
     blind = ContactReader(None, frames[:5], 20.0).read(frames)
-    assert blind.touching.tolist() == readings.touching.tolist() and blind.force is None
+    assert blind.keys() == {"held"} and blind["held"].tolist() == readings["held"].tolist()
 
 
 def test_ends_are_a_goal_chosen_by_object(successes: list[EmbeddedEpisode], tmp_path: Path) -> None:
@@ -238,18 +239,20 @@ def test_ends_are_a_goal_chosen_by_object(successes: list[EmbeddedEpisode], tmp_
     SuccessfulEnds.of([*successes, *others]).save(tmp_path / "goal.npz")
     ends = SuccessfulEnds.load(tmp_path / "goal.npz")
 
-    def chosen(own: EmbeddedEpisode) -> EmbeddedEpisode:
+    def chosen(own: EmbeddedEpisode) -> Features:
         return ends.for_trajectory(own, "goal")
 
+    def count(own: EmbeddedEpisode) -> int:
+        return len(chosen(own)["image"])
+
     other = embedded(9)
-    assert len(ends.frames) == 8 and len(chosen(replace(other, object="pear"))) == 2
-    assert len(chosen(replace(other, object=""))) == 8
-    assert len(chosen(other)) == 6 and len(chosen(successes[0])) == 5, "its own end is left out"
+    assert len(ends.objects) == 8 and count(replace(other, object="pear")) == 2
+    assert count(replace(other, object="")) == 8
+    assert count(other) == 6 and count(successes[0]) == 5, "its own end is left out"
     with pytest.raises(UserError, match="no end with plum, only with apple, pear"):
         chosen(replace(other, object="plum"))
-    mine = part_distances(embedded(9), goal_at_every_frame(chosen(other)))
-    ends_one_by_one = [goal_at_every_frame(e.take(slice(-1, None))) for e in successes]
-    last = [part_distances(embedded(9), end) for end in ends_one_by_one]
+    mine = part_distances(other.features, chosen(other))
+    last = [part_distances(other.features, last_rows([e])) for e in successes]
     for name, d in mine.items():
         assert d == pytest.approx(np.concatenate([one[name] for one in last], 1), abs=1e-6), name
 
@@ -269,28 +272,27 @@ class _Reaching(gym.Env):
         return self.see(), 7.0, False, False, {}
 
     def see(self) -> dict[str, np.ndarray]:
-        picture = np.full((32, 32, 3), 60, np.uint8)
-        picture[12:20, self.at : self.at + 8] = 200
-        return {FRONT: picture}
+        image = np.full((32, 32, 3), 60, np.uint8)
+        image[12:20, self.at : self.at + 8] = 200
+        return {FRONT: image}
 
 
 def test_the_cost_rewards_an_environment() -> None:
     """A step towards the goal pays what the cost falls by; holding still pays nothing."""
     env = _Reaching()
     env.at = 12
-    specs = [GoalPicture(env.see()[FRONT])]
-    model = load_reward_model(inputs_of(env), specs, towers=PaintTowers(), normalizer="none")
-    rewarded = TouchReward(env, model)
+    reward = Reward(env.see()[FRONT], towers=PaintTowers(), normalizer="none")
+    rewarded = RewardWrapper(env, reward)
     _, info = rewarded.reset(seed=0)
     paid = [rewarded.step(np.array([a]))[1] for a in (*[1.0] * 12, 0, 0, 0)]
     assert sum(paid) == pytest.approx(info["cost"])
     assert paid[12:] == [0, 0, 0]
-    by_state = TouchReward(env, model, form="state")
+    by_state = RewardWrapper(env, reward, form="state")
     by_state.reset(seed=0)
-    _, reward, _, _, info = by_state.step(np.array([1.0]))
-    assert reward == -info["cost"] < 0 and info["task_reward"] == 7.0
+    _, paid_now, _, _, info = by_state.step(np.array([1.0]))
+    assert paid_now == -info["cost"] < 0 and info["task_reward"] == 7.0
     with pytest.raises(UserError, match="not known before the end"):
-        TouchReward(env, replace(model, goal=Goal(image=OwnFrame())))
+        RewardWrapper(env, Reward(towers=PaintTowers(), normalizer="none"))
 
 
 def test_a_run_whose_cost_has_risen_for_a_second_has_failed() -> None:

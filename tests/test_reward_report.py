@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
-from rerun_rows import rerun_rows
 from test_episode_embedder import recorded
 from test_success import facts
 from toy_towers import PaintTowers
@@ -21,39 +21,41 @@ from toy_towers import PaintTowers
 from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.rewards.default_goal import goals_of
-from touchgoal.rewards.embed_trajectories import embed_here
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
-from touchgoal.rewards.goals import Bank, Goal, GoalPicture, OwnFrame
-from touchgoal.rewards.measure import Measurement, write_skipped
-from touchgoal.rewards.report.outcome_table import outcome_table
+from touchgoal.rewards.goals import Bank, OwnFrame
+from touchgoal.rewards.measure import Measurement, embed_here, write_skipped
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.record import Record, load_facts
 from touchgoal.rewards.report.report import report_all
-from touchgoal.rewards.reward_model import RewardModel
+from touchgoal.rewards.report.tables import outcome_table
+from touchgoal.rewards.reward import Reward
 from touchgoal.rewards.sources import trajectory
+from touchgoal.rewards.sources.episode_trajectories import default_goals
 from touchgoal.rewards.sources.open_source import open_source
 from touchgoal.runtime.errors import UserError
 
 EPISODE = recorded()
-MODEL = RewardModel(EpisodeEmbedder(PaintTowers(), None), Goal(image=OwnFrame()), None, "raw")
+REWARD = Reward("last", towers=PaintTowers())
 
 
 @pytest.fixture
 def episodes(tmp_path: Path) -> Path:
     """Three successes and a failure with cups, the last success alone with a can."""
     writer = EpisodeWriter(tmp_path / "set")
-    for success, what in ((True, "cup"), (True, "cup"), (False, "cup"), (True, "can")):
-        meta = {"success": success, "object": what, "outcome": "success" if success else "drop"}
-        writer.append(replace(EPISODE, meta=meta))
+    for k, what in enumerate(("cup", "cup", "cup", "can")):
+        meta = {"success": k != 2, "object": what, "outcome": "drop" if k == 2 else "success"}
+        frames = {**EPISODE.frames, FRONT: EPISODE.frames[FRONT] + np.uint8(k)}
+        writer.append(replace(EPISODE, frames=frames, meta=meta))
     return tmp_path / "set"
 
 
-def measure(source: Path, out: Path, model: RewardModel = MODEL) -> Measurement:
-    trajectories = open_source(source, "front", with_touch=False).trajectories
-    measurement = Measurement(trajectories, lambda _: model, out, gamma=1.0, plots=1)
-    measurement.run(partial(embed_here, embedder=model.embedder, workers=2))
-    report_all(measurement.records, out, model.provenance())
+def measure(source: Path, out: Path, reward: Reward = REWARD) -> Measurement:
+    opened = open_source(source, "front", with_touch=False)
+    rewards = reward.prepare_source(opened)
+    first = rewards[opened.trajectories[0].name]
+    measurement = Measurement(opened.trajectories, rewards, out, plots=1)
+    measurement.run(partial(embed_here, embedder=first.embedder))
+    report_all(measurement.records, out, first.provenance())
     return measurement
 
 
@@ -64,8 +66,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_an_interrupted_measurement_goes_on_to_the_same_files(
     episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    measure(episodes, tmp_path / "whole")
-    chunks, begun = MODEL.embedder.embed_chunks, []
+    """And no episode is embedded twice, neither there nor for another goal."""
+    chunks, begun = EpisodeEmbedder.embed_chunks, []
 
     def interrupted(*arguments: Any, **options: Any) -> Any:
         begun.append(arguments)
@@ -73,25 +75,29 @@ def test_an_interrupted_measurement_goes_on_to_the_same_files(
             raise KeyboardInterrupt
         return chunks(*arguments, **options)
 
-    monkeypatch.setattr(MODEL.embedder, "embed_chunks", interrupted)
+    monkeypatch.setattr(EpisodeEmbedder, "embed_chunks", interrupted)
     with pytest.raises(KeyboardInterrupt):
         measure(episodes, tmp_path / "resumed")
     assert len(list((tmp_path / "resumed" / "measured").iterdir())) == 2
     measure(episodes, tmp_path / "resumed")
     assert len(begun) == 5, "what was measured is not measured again"
-    whole = contents(tmp_path / "whole")
-    assert contents(tmp_path / "resumed") == whole
+    measure(episodes, tmp_path / "whole")
+    measure(episodes, tmp_path / "goal", Reward("frame:3", towers=PaintTowers()))
+    assert len(begun) == 5, "another run finds the embeddings inside the set"
+    shutil.rmtree(episodes / ".cache")
+    measure(episodes, tmp_path / "again")
+    assert len(begun) == 9
+    whole = contents(tmp_path / "again")
+    assert contents(tmp_path / "resumed") == whole == contents(tmp_path / "whole")
     assert {"episode_000.png", "episode_003.csv", "frames.parquet", "report.html"} <= whole.keys()
     assert "episode_001.png" not in whole
 
 
 def test_another_goal_under_the_same_name_is_measured_anew(episodes: Path, tmp_path: Path) -> None:
-    picture, out = tmp_path / "goal.png", tmp_path / "out"
-    model = replace(MODEL, goal=Goal(image=GoalPicture(picture)))
-    ends = []
+    image, out, ends = tmp_path / "goal.png", tmp_path / "out", []
     for frame in (0, -1):
-        Image.fromarray(EPISODE.frames[FRONT][frame]).save(picture)
-        measure(episodes, out, model)
+        Image.fromarray(EPISODE.frames[FRONT][frame]).save(image)
+        measure(episodes, out, Reward(f"image:{image}", towers=PaintTowers()))
         ends.append(json.loads((out / "metrics.json").read_text()))
     assert ends[0] != ends[1]
 
@@ -127,13 +133,13 @@ def test_videos_are_found_by_their_names(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_no_failure_is_measured_to_its_own_end(episodes: Path, tmp_path: Path) -> None:
     source = open_source(episodes, "front")
-    goals = goals_of(source.trajectories)
+    goals = default_goals(source.trajectories)
     assert list(goals.values()) == [Bank(episodes)] * 3 + [OwnFrame()]  # the only can
-    assert set(goals_of(source.trajectories[:2]).values()) == {OwnFrame()}
+    assert set(default_goals(source.trajectories[:2]).values()) == {OwnFrame()}
     write_video(tmp_path / "x.mp4", EPISODE.frames[FRONT], 25)
     (tmp_path / "labels.csv").write_text("file,outcome\nx.mp4,drop\n")
     with pytest.raises(UserError, match="x failed, and .* --goal image:FILE"):
-        goals_of(open_source(tmp_path / "x.mp4", "front").trajectories)
+        default_goals(open_source(tmp_path / "x.mp4", "front").trajectories)
 
 
 def test_outcomes_are_compared_by_goals_of_others_alone() -> None:
@@ -204,19 +210,6 @@ def test_page_holds_everything(pages: Callable[..., Path]) -> None:
     assert "curves" not in data_of(index)["episodes"][0]
     assert data_of(index)["episodes"][3]["page"] == "report_002.html#episode_003"
     assert len(data_of(index.with_name("report_002.html"))["episodes"]) == 1
-
-
-def test_a_recording_for_rerun(episodes: Path, tmp_path: Path) -> None:
-    """Read back by rerun itself: pictures of camera and fingertips, and curves, at every frame."""
-    pytest.importorskip("rerun", reason="extra viz")
-    from touchgoal.rewards.report.rerun_recording import write_recording
-
-    measurement = measure(episodes, tmp_path / "out")
-    trajectories = open_source(episodes, "front").trajectories
-    write_recording(str(tmp_path / "curves.rrd"), trajectories, measurement.records)
-    rows = rerun_rows(tmp_path / "curves.rrd")
-    for part in ("front", "tactile_left", "tactile_right", "cost/image"):
-        assert rows[f"/episode_000/{part}"] == trajectories[0].length
 
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")

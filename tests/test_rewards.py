@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,13 +15,13 @@ from hypothesis import strategies as st
 
 from touchgoal.control.features import TACTILE_LEFT, TACTILE_RIGHT
 from touchgoal.rewards.curves import Contact, Curves, potential_reward, state_reward
-from touchgoal.rewards.distance.embedding_distance import compute_curves, compute_distances
+from touchgoal.rewards.distance.cost import compute_curves, plain_distances
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal, take_rows
 from touchgoal.rewards.goals import (
     EpisodeEnd,
-    GoalPicture,
+    GoalImage,
     Modality,
     OwnFrame,
     Sentence,
@@ -44,7 +45,7 @@ ALL: tuple[Modality, ...] = ("image", "tactile", "text")
 MADE = EmbeddingSource("towers", "camera", "encoder", "sensor")
 
 # Embeddings are directions in the plane, so that a distance is 1 - cos of an angle: at the start
-# everything lies at 90 degrees, the goal picture at 0, a held apple at 30, its sentence at 60.
+# everything lies at 90 degrees, the goal image at 0, a held apple at 30, its sentence at 60.
 
 
 def direction(degrees: Sequence[float] | Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
@@ -61,9 +62,11 @@ def embedded(name: str, touches: bool = True, jitter: float = 0.0) -> EmbeddedEp
         fps=20.0,
         contact=Contact(CONTACT if touches else None, "truth"),
         made_with=MADE,
-        image=direction(np.linspace(90, 0, N) + jitter * rng.normal(size=N)),
+        features={
+            "image": direction(np.linspace(90, 0, N) + jitter * rng.normal(size=N)),
+            "touch": direction(angles.T),
+        },
         sides=(TACTILE_LEFT, TACTILE_RIGHT),
-        touch=direction(angles),
         descriptions=direction([60.0]),
         object="apple",
         success=touches,
@@ -73,11 +76,14 @@ def embedded(name: str, touches: bool = True, jitter: float = 0.0) -> EmbeddedEp
 fit_scene = partial(fit_normalizer, scene="simulated pick-place")
 
 
-def goal_of(episode: EmbeddedEpisode) -> EmbeddedGoal:
-    assert episode.touch is not None and episode.descriptions is not None
+def with_touch(episode: EmbeddedEpisode, touch: np.ndarray, **changes: Any) -> EmbeddedEpisode:
+    return replace(episode, features={**episode.features, "touch": touch}, **changes)
+
+
+def goal_of(episode: EmbeddedEpisode, *names: str) -> EmbeddedGoal:
     forms = {str(name): f"episode:{episode.source}#0" for name in ALL}
-    ends = episode.pictures()[-1:], episode.touch[:, -1:], episode.descriptions[:1]
-    return EmbeddedGoal(forms, frozenset(), *ends)
+    ends = {**take_rows(episode.features, slice(-1, None)), "text": episode.descriptions[:1]}
+    return EmbeddedGoal({k: v for k, v in ends.items() if not names or k in names}, forms)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +91,7 @@ def goal_of(episode: EmbeddedEpisode) -> EmbeddedGoal:
     [
         ("last", OwnFrame()),
         ("frame:0", OwnFrame(0)),
-        ("image:ends/cup.png", GoalPicture(Path("ends/cup.png"))),
+        ("image:ends/cup.png", GoalImage(Path("ends/cup.png"))),
         ("episode:data/a#b#12", EpisodeEnd(Path("data/a#b"), 12)),
         ("text:hard, smooth: round", Sentence("hard, smooth: round")),
     ],
@@ -121,35 +127,34 @@ def test_words_that_only_contain_a_negation_are_taken(text: str) -> None:
 
 
 def test_each_modality_takes_the_first_goal_that_speaks_for_it() -> None:
-    last, picture, words = OwnFrame(), GoalPicture(Path("a.png")), Sentence("soft")
-    chosen = assign_goals([picture, last, words], ALL)
-    assert (chosen.image, chosen.tactile, chosen.text) == (picture, last, words)
+    last, image, words = OwnFrame(), GoalImage(Path("a.png")), Sentence("soft")
+    chosen = assign_goals([image, last, words], ALL)
+    assert (chosen.image, chosen.tactile, chosen.text) == (image, last, words)
     assert chosen.as_dict() == {"image": "image:a.png", "tactile": "last", "text": "text:soft"}
     with pytest.raises(UserError, match="'image:a.png' is never used: 'last' before it"):
-        assign_goals([last, picture], ALL)
+        assign_goals([last, image], ALL)
     with pytest.raises(UserError, match="offline image tower knows no words: give --towers"):
         assign_goals([last, words], ["image"])
-    assert assign_goals([words], ["image"], picture_words=True).image == words
-    assert assign_goals([last, words], ALL, picture_words=True).text == words
+    assert assign_goals([words], ["image"], image_words=True).image == words
+    assert assign_goals([last, words], ALL, image_words=True).text == words
 
 
 def test_distances_by_hand() -> None:
     e = embedded("a")
-    raw = compute_distances(e, goal_of(e), completed=False)
+    raw = plain_distances(e.features, goal_of(e).features, completed=False)
     assert raw["image"][[0, -1]] == pytest.approx([1, 0], abs=1e-6)
     assert raw["tactile"][[0, -1]] == pytest.approx([1 - np.cos(np.pi / 3), 0], abs=1e-6)
     assert raw["text"] == pytest.approx(np.full(N, 1 - np.cos(np.pi / 6)), abs=1e-6)
-    assert e.touch is not None
-    one_hand = replace(e, touch=np.stack([e.touch[0], np.repeat(direction([90]), N, axis=0)]))
-    mean = compute_distances(one_hand, goal_of(e), completed=False)["tactile"][-1]
-    assert mean == pytest.approx((1 - np.cos(np.pi / 3)) / 2, abs=1e-6)
+    touch = e.features["touch"].copy()
+    touch[:, 1] = direction([90.0])
+    one_hand = plain_distances({**e.features, "touch": touch}, goal_of(e).features, completed=False)
+    assert one_hand["tactile"][-1] == pytest.approx((1 - np.cos(np.pi / 3)) / 2, abs=1e-6)
 
 
 def test_equal_touches_are_at_distance_0_faint_ones_too() -> None:
     e = embedded("a")
-    assert e.touch is not None
     for strength in (1.0, 0.5, 0.0):  # whitened embeddings are short, and 0 without contact
-        faint = replace(e, touch=np.float32(strength) * e.touch)
+        faint = with_touch(e, np.float32(strength) * e.features["touch"])
         tactile = compute_curves(faint, goal_of(faint), None).raw["tactile"]
         assert tactile[-1] == pytest.approx(0, abs=1e-6)
         assert tactile[0] == pytest.approx(strength**2 * (1 - np.cos(np.pi / 3)), abs=1e-6)
@@ -177,8 +182,7 @@ def replace_text(normalizer: DistanceNormalizer) -> DistanceNormalizer:
 
 def test_touch_goals_are_ends_with_the_same_object() -> None:
     apple = embedded("apple")
-    assert apple.touch is not None
-    pear = replace(apple, touch=-apple.touch, object="pear")
+    pear = with_touch(apple, -apple.features["touch"], object="pear")
     normalizer = fit_scene([apple, replace(apple), pear], ["tactile"])
     assert normalizer.goal["tactile"] == pytest.approx(0, abs=1e-6)
     with pytest.raises(UserError, match="nearer the goal in 0% of 2 pairs"):
@@ -189,8 +193,8 @@ def test_touch_goals_are_ends_with_the_same_object() -> None:
 
 def test_scale_refuses_what_would_mislead() -> None:
     good = embedded("good")
-    lost = replace(good, touch=direction([[90.0] * 20 + [140.0] * 20] * 2))
-    held = replace(good, touch=direction([[90.0] * 20 + [60.0] * 20] * 2))
+    lost = with_touch(good, direction([[90.0] * 2] * 20 + [[140.0] * 2] * 20))
+    held = with_touch(good, direction([[90.0] * 2] * 20 + [[60.0] * 2] * 20))
     misses = [embedded("a" * k, touches=False, jitter=1.0) for k in range(1, 9)]
     other = replace(good, made_with=EmbeddingSource("z", "camera"))
     cases: list[tuple[list[EmbeddedEpisode], Modality, str]] = [
@@ -206,8 +210,8 @@ def test_scale_refuses_what_would_mislead() -> None:
     with pytest.raises(UserError, match="it has no 'tactile', only image, image .same episode."):
         compute_curves(good, goal_of(good), normalizer)
     own_camera = replace(good, made_with=EmbeddingSource("towers", camera=""))
-    picture = replace(goal_of(good), touch=None, text=None)
-    assert compute_curves(own_camera, picture, normalizer).normalised  # a plain video, vouched for
+    image = goal_of(good, "image")
+    assert compute_curves(own_camera, image, normalizer).normalised  # a plain video, vouched for
 
 
 @pytest.mark.parametrize("what", ["towers", "camera", "encoder", "sensor"])
@@ -244,10 +248,10 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
     raw = {"image": 0.3 * fall, "tactile": 0.5 * fall}
     normalised = {"image": fall, "tactile": fall**2}
     curves = Curves("a $ path$ #3", goal, 20.0, Contact(12, "truth"), raw, normalised)
-    paths = write_report(curves, tmp_path / "out", "ep3", {"encoder": "tiny"}, gamma=0.9)
+    paths = write_report(curves, tmp_path / "out", "ep3", {"encoder": "tiny"})
     with paths["csv"].open() as file:
         rows = list(csv.DictReader(file))
-    shaping = potential_reward(fall, 0.9 ** (1 / 20))
+    shaping = potential_reward(fall, 1.0)
     for column, expected in {
         "time_s": np.arange(30) / 20,
         "cost_image+tactile": (fall + fall**2) / 2,
@@ -257,10 +261,9 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
     }.items():
         assert [float(r[column]) for r in rows] == pytest.approx(expected, abs=1e-6), column
     content = json.loads(paths["json"].read_text())
-    assert content["potential_reward"]["gamma"] == 0.9
     assert content["provenance"] == {"encoder": "tiny"} and content["contact"]["frame"] == 12
     first = paths["png"].read_bytes()
-    assert write_report(curves, tmp_path, "ep3", {}, gamma=0.9)["png"].read_bytes() == first
+    assert write_report(curves, tmp_path, "ep3", {})["png"].read_bytes() == first
 
 
 # Small integers make ties and plateaus common; halves keep every sum exact.

@@ -12,7 +12,7 @@ from touchgoal.episodes.outcomes.generate import MADE, made_failures
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.touches import contact_per_frame
 from touchgoal.rewards.report.record import Facts
-from touchgoal.rewards.report.success_table import SUCCESSES, success_table
+from touchgoal.rewards.report.tables import SUCCESSES, success_table
 from touchgoal.rewards.success import SUCCESS, fit_success, load_success_threshold
 from touchgoal.runtime.errors import UserError
 

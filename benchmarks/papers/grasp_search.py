@@ -19,13 +19,12 @@ from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
 from touchgoal.control.features import CAMERAS, TACTILE, WRENCH, Observation
 from touchgoal.episodes.schema import Episode
 from touchgoal.policies.evaluation.success_rate import SuccessRate
-from touchgoal.rewards.distance.embedding_distance import compute_curves
-from touchgoal.rewards.distance.parts import FUSED
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal, goal_at_every_frame
-from touchgoal.rewards.goals import parse_goal
+from touchgoal.rewards.curves import FUSED
+from touchgoal.rewards.distance.cost import compute_curves
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal, last_rows
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.online.reward_wrapper import inputs_of
-from touchgoal.rewards.reward_model import load_reward_model
+from touchgoal.rewards.reward import Reward
+from touchgoal.rewards.reward_wrapper import inputs_of
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Positive, checked_dataclass
 from touchgoal.runtime.parallel.parallel_map import parallel_map
@@ -108,7 +107,7 @@ class _Rig:
 
     def __init__(self, config: Config, name: str) -> None:
         self.env = PickPlace(replace(config.env, objects=(name,)))
-        self._model = load_reward_model(inputs_of(self.env), [parse_goal("last")], config.encoder)
+        self._reward = Reward(encoder=config.encoder).prepare(inputs_of(self.env))
 
     def lift(self, seed: int, shift: Shift) -> tuple[Episode, bool]:
         """Try a grasp `shift` (m) beside the object; return first and last frames, and whether it rose."""
@@ -126,17 +125,17 @@ class _Rig:
 
     def goal(self, lifts: Iterable[int]) -> EmbeddedGoal:
         """Return the ends of lifts by somebody who knows where the object is."""
-        ends = [self._embed(self.lift(seed, np.zeros(3))[0]) for seed in lifts]
-        ends = [end.take(slice(-1, None)) for end in ends]
-        return goal_at_every_frame(ends[0].extended(ends[1:]))
+        return EmbeddedGoal(
+            last_rows(self._embed(self.lift(seed, np.zeros(3))[0]) for seed in lifts)
+        )
 
     def costs(self, ends: Sequence[Episode], goal: EmbeddedGoal, row: str) -> list[float]:
         """Return the last cost of each trial; the shipped value, which is of another task, is left out."""
-        curves = [compute_curves(self._embed(e), goal, self._model.normalizer) for e in ends]
-        return [float(c.costs[row][-1]) for c in curves]
+        curves = [compute_curves(self._embed(e), goal, self._reward.normalizer) for e in ends]
+        return [float({**c.costs, **c.plain}[row][-1]) for c in curves]
 
     def _embed(self, episode: Episode) -> EmbeddedEpisode:
-        return self._model.embedder.embed_episode(episode, 1.0, "a trial")
+        return self._reward.embedder.embed_episode(episode, 1.0, "a trial")
 
 
 def _episode(seen: Sequence[Observation]) -> Episode:

@@ -44,7 +44,7 @@ from touchgoal.policies.training.sequence_dataset import (
     load_recordings,
 )
 from touchgoal.policies.training.train import POLICY, SNAPSHOTS, train
-from touchgoal.rewards.distance.parts import FUSED
+from touchgoal.rewards.curves import FUSED
 from touchgoal.rewards.success import fit_success
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, checked_dataclass

@@ -68,10 +68,9 @@ def judge_depth(grasps: list[ForceGrasp]) -> dict[str, float]:
         readings = ContactReader(GELSIGHT_WEDGE, frames[:_FIRST], GELSIGHT_WEDGE.frame_rate).read(
             frames
         )
-        assert readings.force is not None  # the sensor has a file
         force = grasp.force[: len(frames)]
-        in_contact = readings.touching[0] & (np.abs(force) < _IMPOSSIBLE)
-        ranks[grasp.trial] = spearman(readings.force[0][in_contact], force[in_contact])
+        in_contact = readings["held"] & (np.abs(force) < _IMPOSSIBLE)
+        ranks[grasp.trial] = spearman(readings["force"][in_contact], force[in_contact])
     return {trial: rank for trial, rank in ranks.items() if rank is not None}
 
 

@@ -19,9 +19,8 @@ from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import OfflineTowers
 from touchgoal.rewards.features.contact_reading import ContactReader
-from touchgoal.rewards.features.embedder import EpisodeEmbedder
-from touchgoal.rewards.features.feature_stream import Frames
-from touchgoal.rewards.value.value import Value, ValueConfig
+from touchgoal.rewards.features.embedder import EpisodeEmbedder, Frames
+from touchgoal.rewards.value import Value, ValueConfig
 
 _BATCH = 32  # frames of a recording at once
 _WHOLE = "a frame with both cameras and fingertips, "

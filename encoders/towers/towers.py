@@ -102,6 +102,14 @@ class OfflineTowers:
         return network.requires_grad_(False).to(self.device)
 
     @cached_property
+    def image_weights(self) -> str:
+        """Short hash of the ImageNet network's weights."""
+        digest = hashlib.sha256()
+        for weight in self.image_tower.state_dict().values():
+            digest.update(weight.cpu().numpy().tobytes())
+        return digest.hexdigest()[:12]
+
+    @cached_property
     def text_tower(self) -> minilm.SentenceEncoder:
         """Return the sentence encoder."""
         return minilm.SentenceEncoder(self.device)

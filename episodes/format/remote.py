@@ -43,7 +43,7 @@ def local_folder(path: Path) -> Path:
         return local_folder(Path(f"{url}/episodes"))  # the folder of a run
     if _INFO not in files:
         raise UserError(f"{url} is not a set of episodes (it has no {_INFO}): check the address")
-    root = _cache_folder() / url.replace("://", "/")
+    root = cache_folder() / url.replace("://", "/")
     _delete_outdated(root, files)
     for name in files:
         if name.startswith("meta/") and ".." not in name and not (root / name).exists():
@@ -76,7 +76,8 @@ def _address(path: Path) -> str | None:
     return "://".join(match.groups()) if match and ".." not in path.parts else None
 
 
-def _cache_folder() -> Path:
+def cache_folder() -> Path:
+    """Return the user's folder for what can be made or fetched again."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "touchgoal"
 
 

@@ -53,7 +53,9 @@ def align_touch(config: Align) -> None:
         return
     embedder = EpisodeEmbedder(towers, encoder)
     embedded = [
-        embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}", True)
+        embedder.describe(
+            embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}"), data.meta(i)
+        )
         for i in track(successes[: config.normalizer_episodes], "normalizer", "episode")
     ]
     normalizer = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))

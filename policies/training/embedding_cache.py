@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float16
 
+from touchgoal.episodes.embedding_files import embedding_file
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
@@ -52,9 +53,7 @@ def cached_embeddings(
 
 
 def _cache_path(episodes: EpisodeSet, embedder: Embedder, i: int) -> Path:
-    """Return the file inside the set, named by episode and encoder weights."""
-    folder = episodes.root / ".cache" / "embeddings" / embedder.name.replace("/", "_")
-    return folder / f"{episodes.episode_checksum(i)[:32]}.npy"
+    return embedding_file(episodes, i, embedder.name, ".npy")
 
 
 def _fill_cache(
@@ -63,7 +62,6 @@ def _fill_cache(
     missing = [i for i in chosen if not _cache_path(episodes, embedder, i).exists()]
     if not missing:
         return
-    _cache_path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
     embed = partial(embed_episode, episodes, embedder)
     with (
         nullcontext(map(embed, missing))

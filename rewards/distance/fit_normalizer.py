@@ -5,10 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.rewards.distance.embedding_distance import (
-    text_distances,
-    touch_distances,
-)
+from touchgoal.rewards.distance.cost import text_distances, touch_distances
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, median_name
 from touchgoal.rewards.distance.parts import (
     SMALLEST_UNIT,
@@ -16,7 +13,7 @@ from touchgoal.rewards.distance.parts import (
     cosine_distances,
     part_distances,
 )
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, goal_at_every_frame
+from touchgoal.rewards.features.embedded import IMAGE, TOUCH, EmbeddedEpisode, last_rows
 from touchgoal.rewards.goals import Modality
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
@@ -76,10 +73,8 @@ def fit_units(episodes: Sequence[EmbeddedEpisode]) -> dict[str, float]:
     for group in by_object.values():
         if len(group) < 2:
             continue
-        ends = [episode.take(slice(len(episode) - 1, None)) for episode in group]
-        together = ends[0].extended(ends[1:])
-        others = ~np.eye(len(ends), dtype=bool)
-        for name, d in part_distances(together, goal_at_every_frame(together)).items():
+        ends, others = last_rows(group), ~np.eye(len(group), dtype=bool)
+        for name, d in part_distances(ends, ends).items():
             spreads.setdefault(name, []).append(float(np.quantile(d[others], SPREAD_QUANTILE)))
     return {
         name: max(float(np.mean(spread)), SMALLEST_UNIT.get(name, SMALLEST_UNIT["front"]))
@@ -112,13 +107,9 @@ def _check_training(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Mo
     if not episodes:
         raise UserError("a normalizer needs at least one successful training episode, got none")
     for e in episodes:
-        missing = [m for m in modalities if m not in e.modalities]
-        if "text" in modalities and e.descriptions is None:
-            missing.append("text")
-        if missing:
+        if missing := [m for m in modalities if m not in e.modalities]:
             raise UserError(
-                f"{e.source} has nothing for {' and '.join(dict.fromkeys(missing))}: leave it out "
-                "of --modalities"
+                f"{e.source} has nothing for {' and '.join(missing)}: leave it out of --modalities"
             )
         if e.success is False:
             raise UserError(f"{e.source} failed; fit a normalizer on successful episodes alone")
@@ -154,9 +145,9 @@ def _training_distances(
 def _distances_to_goals(
     episode: EmbeddedEpisode, goals: Sequence[EmbeddedEpisode], modality: Modality
 ) -> Float[np.ndarray, "n g"]:
+    if modality == "text":
+        return text_distances(episode.features[TOUCH], episode.descriptions)
+    ends = last_rows(goals)
     if modality == "image":
-        return cosine_distances(episode.pictures(), np.stack([o.pictures()[-1] for o in goals]))
-    if modality == "tactile":
-        return touch_distances(episode.touches(), np.stack([o.touches()[:, -1] for o in goals], 1))
-    assert episode.descriptions is not None  # checked with the training episodes
-    return text_distances(episode.touches(), episode.descriptions)
+        return cosine_distances(episode.features[IMAGE], ends[IMAGE])
+    return touch_distances(episode.features[TOUCH], ends[TOUCH])

@@ -17,6 +17,8 @@ fused cost.
     force         grip force, from the depth of the gel: a line of its own, not in the fused cost
     words         touch against a sentence: the normalised distance, clipped to [0, 1]
     value         1 - the progress that a `Value` predicts; it does not depend on the goal
+
+`features.embedded` has the arrays that the distances are computed from.
 """
 
 from collections.abc import Mapping
@@ -25,18 +27,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32
 from scipy.signal import lfilter
 
-from touchgoal.control.features import IMAGE_PREFIX
-from touchgoal.rewards.curves import UNITS_AT_HALF
-from touchgoal.rewards.features.contact_reading import ContactReadings
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
+from touchgoal.rewards.curves import FUSED, UNITS_AT_HALF
+from touchgoal.rewards.features.embedded import TOUCH, Features, cameras_of
 
 Costs = dict[str, Float[np.ndarray, " n"]]
 
 TOUCH_PARTS = ("object", "force", "centre", "held", "slip")
-FUSED, VALUE, WORDS, FORCE = "fused", "value", "words", "force"
+VALUE, WORDS, FORCE = "value", "words", "force"
 VALUE_SHARE = 0.4
 """Share of the value in a fused cost; the rest is the root mean square of the parts. Chosen, like the
-form of a part's cost, on objects that `benchmark reward-quality` does not judge on."""
+form of a part's cost, on objects that benchmark reward-quality does not judge on."""
 SMALLEST_UNIT = {
     "front": 1e-3,
     "wrist": 1e-3,
@@ -54,32 +54,29 @@ SPREAD_QUANTILE = 0.9  # of distances between ends that all succeeded: their spr
 _FORCE_FLOOR = 0.5  # N, below which the depth of a gel reads noise
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
 _SOFTNESS = 8.0  # exponent of the soft minimum
+_WRIST_MAP = "wrist_map"
 _CHUNK = 256  # frames of maps in float64 at once
 SMOOTHING = 0.1  # time constant of the causal smoothing, s
 
 
-def part_distances(
-    episode: EmbeddedEpisode, goal: EmbeddedGoal
-) -> dict[str, Float[np.ndarray, "n g"]]:
+def part_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndarray, "n g"]]:
     """Return the distance of each frame to each goal, for the parts that both have.
 
-    Pictures: cosine distance, at stride 16 its mean over positions. Object: half the squared
+    Images: cosine distance, at stride 16 its mean over positions. Object: half the squared
     distance of embeddings. Force: |log ratio| of the mean over the fingertips. Centre: m. Held: 0
     or 1. Slip: m, whatever the goal. These are means over the fingertips. Wrench: N.
     """
     distances = {}
-    for key, camera in goal.cameras.items():
-        if (mine := episode.cameras.get(key)) is None:
-            continue
-        name = key.removeprefix(IMAGE_PREFIX)
-        distances[name] = cosine_distances(mine.pooled, camera.pooled)
-        if name == "wrist" and mine.map is not None and camera.map is not None:
-            distances["wrist_map"] = map_distances(mine.map, camera.map)
-    if goal.touch is not None and goal.readings is not None and episode.readings is not None:
-        distances["object"] = object_distances(episode.touches(), goal.touch)
-        distances |= contact_distances(episode.readings, goal.readings)
-    if goal.wrench is not None and episode.wrench is not None:
-        force, wanted = (w[:, :3].astype(np.float64) for w in (episode.wrench, goal.wrench))
+    for name in cameras_of(goal):
+        if name in mine:
+            distances[name] = cosine_distances(mine[name], goal[name])
+        if name == "wrist" and _WRIST_MAP in mine and _WRIST_MAP in goal:
+            distances[_WRIST_MAP] = map_distances(mine[_WRIST_MAP], goal[_WRIST_MAP])
+    if TOUCH in goal and "held" in goal and "held" in mine:
+        distances["object"] = object_distances(mine[TOUCH], goal[TOUCH])
+        distances |= contact_distances(mine, goal)
+    if "wrench" in goal and "wrench" in mine:
+        force, wanted = (f["wrench"][:, :3].astype(np.float64) for f in (mine, goal))
         distances["wrench"] = np.linalg.norm(force[:, None] - wanted, axis=-1)
     return distances
 
@@ -101,31 +98,35 @@ def map_distances(
 
 
 def object_distances(
-    touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "sides g k"]
+    touch: Float32[np.ndarray, "n sides k"], goals: Float32[np.ndarray, "g sides k"]
 ) -> Float[np.ndarray, "n g"]:
     """Return half the squared distance of embeddings: 1 - cos for unit vectors, 0 for equal ones."""
-    mine, theirs = touch.astype(np.float64), goals.astype(np.float64)
-    square = (mine**2).sum(-1)[:, :, None] + (theirs**2).sum(-1)[:, None]
-    return (square / 2 - mine @ theirs.transpose(0, 2, 1)).mean(0)
+    mine, theirs = (np.square(t, dtype=np.float64).sum(-1).mean(1) for t in (touch, goals))
+    return (mine[:, None] + theirs) / 2 - mean_products(touch, goals)
 
 
-def contact_distances(
-    mine: ContactReadings, goal: ContactReadings
-) -> dict[str, Float[np.ndarray, "n g"]]:
+def mean_products(
+    touch: Float32[np.ndarray, "n sides k"], goals: Float32[np.ndarray, "g sides k"]
+) -> Float[np.ndarray, "n g"]:
+    """Return the dot product of each touch with each goal's same fingertip, mean over them."""
+    return np.einsum("nsk,gsk->ng", touch, goals, dtype=np.float64) / touch.shape[1]
+
+
+def contact_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndarray, "n g"]]:
     """Return the distances of force (log ratio), centre (m), slip (m), and of being held (0 or 1)."""
-    apart = mine.touching[:, :, None] != goal.touching[:, None]
-    distances = {"held": apart.any(0).astype(np.float64)}
-    if mine.force is not None and goal.force is not None:
+    apart = mine["held"][:, None] != goal["held"]
+    distances = {"held": apart.any(-1).astype(np.float64)}
+    if FORCE in mine and FORCE in goal:
         force, wanted = (
-            np.log(r.astype(np.float64).mean(0) + _FORCE_FLOOR) for r in (mine.force, goal.force)
+            np.log(f[FORCE].astype(np.float64).mean(1) + _FORCE_FLOOR) for f in (mine, goal)
         )
-        distances["force"] = np.abs(force[:, None] - wanted)
-    if mine.centre is not None and goal.centre is not None:
-        away = np.linalg.norm(mine.centre[:, :, None] - goal.centre[:, None], axis=-1)
-        distances["centre"] = np.where(apart, _NO_CONTACT, away).mean(0).astype(np.float64)
-    if mine.slip is not None:
-        slip = mine.slip.astype(np.float64).mean(0)
-        distances["slip"] = np.repeat(slip[:, None], goal.touching.shape[1], axis=1)
+        distances[FORCE] = np.abs(force[:, None] - wanted)
+    if "centre" in mine and "centre" in goal:
+        away = np.linalg.norm(mine["centre"][:, None] - goal["centre"], axis=-1)
+        distances["centre"] = np.where(apart, _NO_CONTACT, away).mean(-1).astype(np.float64)
+    if "slip" in mine:
+        slip = mine["slip"].astype(np.float64).mean(1)
+        distances["slip"] = np.repeat(slip[:, None], len(goal["held"]), axis=1)
     return distances
 
 
@@ -139,29 +140,28 @@ def soft_minimum(distances: Float[np.ndarray, "n g"]) -> Float[np.ndarray, " n"]
     return (weights * distances).sum(1) / weights.sum(1)
 
 
-def part_costs(episode: EmbeddedEpisode, goal: EmbeddedGoal, units: Mapping[str, float]) -> Costs:
+def part_costs(mine: Features, goal: Features, units: Mapping[str, float]) -> Costs:
     """Return the cost of each part that has a unit, in [0, 1]; fingertip parts gated by contact."""
     own, costs = goal_spread(goal), {}
-    for name, d in part_distances(episode, goal).items():
+    for name, d in part_distances(mine, goal).items():
         if name in units:
             half = (UNITS_AT_HALF * max(units[name], own.get(name, 0.0))) ** 2
             square = soft_minimum(d) ** 2
             costs[name] = square / (square + half)
-    if episode.readings is None or goal.readings is None:
+    if "held" not in mine or "held" not in goal:
         return costs
-    touching = np.asarray(episode.readings.touching.any(axis=0))
-    wanted = bool(goal.readings.touching.any())
+    touching, wanted = mine["held"].max(axis=1), bool(goal["held"].any())
     gated = {k: gate(c, touching, wanted) for k, c in costs.items() if k in TOUCH_PARTS}
     return costs | gated
 
 
-def goal_spread(goal: EmbeddedGoal) -> dict[str, float]:
+def goal_spread(goal: Features) -> dict[str, float]:
     """Return by part how far several goals are from each other, each measured to the others.
 
     Parts with a single goal are left out, and slip, which does not depend on the goal.
     """
     spread = {}
-    for name, d in part_distances(goal.as_frames(), goal).items():
+    for name, d in part_distances(goal, goal).items():
         if (n := len(d)) > 1 and name != "slip":
             others = d[~np.eye(n, dtype=bool)].reshape(n, n - 1)
             spread[name] = float(np.quantile(soft_minimum(others), SPREAD_QUANTILE))

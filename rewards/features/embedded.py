@@ -1,145 +1,149 @@
-"""Embedded trajectories and goals: everything that a distance is computed from."""
+"""Embedded episodes and goals: one array for each part, everything that a distance is computed from.
 
-from collections.abc import Mapping, Sequence
+    front, wrist    (n, d)         pooled features of the camera of that name, unit vectors
+    front_map, ...  (n, c, y, x)   its feature map at stride 16, float16
+    touch           (n, sides, k)  touch embedding
+    held            (n, sides)     whether the fingertip touches
+    force           (n, sides)     normal force, N; 0 without contact
+    centre          (n, sides, 2)  centre of the contact, m from the image's middle, x and y
+    slip            (n, sides)     m, see `SlipMeter`
+    wrench          (n, 6)         external force N and torque Nm, base frame
+    image           (n, d)         pooled features of the measured camera; or a sentence as its goal
+    text            (n, k)         sentence, comparable with touch; text_baseline: the one against it
+
+Without parts there are image and touch alone. Force, centre and slip need a sensor with a file.
+"""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
-from jaxtyping import Float16, Float32
+from jaxtyping import Float32
 
+from touchgoal.control.features import IMAGE_PREFIX
+from touchgoal.episodes.schema import MetaValue
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
-from touchgoal.rewards.features.contact_reading import ContactReadings
 from touchgoal.rewards.goals import Modality
+from touchgoal.runtime.atomic_write import atomic_write
 
-Rows = slice | np.ndarray
+Features = Mapping[str, np.ndarray]
+"""Arrays by part, frames (or goals) first."""
+
+IMAGE, TOUCH, TEXT, TEXT_BASELINE = "image", "touch", "text", "text_baseline"
+FINGERTIPS = (TOUCH, "held", "force", "centre", "slip")
+"""Parts with an axis of fingertips."""
+_TOUCHED = (*FINGERTIPS, "wrench")  # parts that the goal of touch sets
+_MAP = "_map"
 
 
 @dataclass(frozen=True, eq=False)
-class CameraFeatures:
-    """Features of one camera's images, by one pass of the image tower."""
-
-    pooled: Float32[np.ndarray, "n d"]  # unit vectors
-    map: Float16[np.ndarray, "n c y x"] | None = None  # at stride 16; None from other towers
-
-    def take(self, rows: Rows) -> "CameraFeatures":
-        """Return the features of some frames."""
-        return CameraFeatures(self.pooled[rows], None if self.map is None else self.map[rows])
-
-    @staticmethod
-    def join(pieces: "Sequence[CameraFeatures]") -> "CameraFeatures":
-        """Return consecutive features of one camera as one."""
-        maps = [p.map for p in pieces if p.map is not None]
-        pooled = np.concatenate([p.pooled for p in pieces])
-        return CameraFeatures(pooled, np.concatenate(maps) if maps else None)
-
-
-@dataclass(frozen=True)
 class EmbeddedEpisode:
     """One embedded trajectory; its distance to a goal is then a dot product per frame."""
 
+    features: Features
+    made_with: EmbeddingSource  # encoders and sensors; embeddings of others cannot be compared
     source: str  # name of the trajectory, for people
     fps: float  # frames per second
-    contact: Contact  # first contact
-    made_with: EmbeddingSource  # encoders and sensors; embeddings of others cannot be compared
-    image: Float32[np.ndarray, "n d"] | None = None  # unit image embeddings; None without a camera
     sides: tuple[str, ...] = ()  # keys of the fingertips that have touch embeddings
-    touch: Float32[np.ndarray, "sides n k"] | None = None  # unit embeddings; None without touch
-    # unit embeddings of the sentences about its object; None without sentences, or not requested
-    descriptions: Float32[np.ndarray, "m k"] | None = None
+    contact: Contact = Contact(None, "not looked for")
     object: str = ""  # catalogue id of the object, "" if unknown
     success: bool | None = None  # whether the episode reached its goal, None if unknown
-    words: bool = True  # whether its touch embeddings can be compared with sentences
-    # features of the parts of a cost, by key of the camera; empty and None if not requested
-    cameras: Mapping[str, CameraFeatures] = field(default_factory=dict)
-    readings: ContactReadings | None = None  # contact of the fingertips `sides`
-    wrench: Float32[np.ndarray, "n 6"] | None = None  # external force N, torque Nm; base frame
+    # unit embeddings of the sentences about its object; empty without any, or if not requested
+    descriptions: Float32[np.ndarray, "m k"] = field(
+        default_factory=lambda: np.zeros((0, 0), np.float32)
+    )
 
     def __len__(self) -> int:
-        return self.touches().shape[1] if self.image is None else len(self.image)
+        return len(next(iter(self.features.values())))
 
     @property
     def modalities(self) -> tuple[Modality, ...]:
-        """Modalities that can be measured."""
-        image: tuple[Modality, ...] = () if self.image is None else ("image",)
-        touch: tuple[Modality, ...] = () if self.touch is None else ("tactile",)
-        return (*image, *touch, "text") if touch and self.words else (*image, *touch)
+        """Modalities that a normalizer can be fitted to."""
+        there = (IMAGE in self.features, TOUCH in self.features, bool(len(self.descriptions)))
+        names: tuple[Modality, ...] = ("image", "tactile", "text")
+        return tuple(name for name, known in zip(names, there, strict=True) if known)
 
-    def pictures(self) -> Float32[np.ndarray, "n d"]:
-        """Return the image embeddings of a trajectory that has the modality image."""
-        assert self.image is not None, f"{self.source} has no pictures"
-        return self.image
+    def with_facts(self, meta: Mapping[str, MetaValue]) -> "EmbeddedEpisode":
+        """Return the trajectory with the object and the outcome that its meta name."""
+        success = meta.get("success")
+        known = None if success is None else bool(success)
+        return replace(self, object=str(meta.get("object", "")), success=known)
 
-    def touches(self) -> Float32[np.ndarray, "sides n k"]:
-        """Return the touch embeddings of a trajectory that has the modality tactile."""
-        assert self.touch is not None, f"{self.source} has no touch"
-        return self.touch
-
-    def take(self, rows: Rows) -> "EmbeddedEpisode":
+    def take(self, rows: slice | np.ndarray) -> "EmbeddedEpisode":
         """Return the trajectory with some of its frames; its first contact stays as it was."""
-        return replace(
-            self,
-            image=None if self.image is None else self.image[rows],
-            touch=None if self.touch is None else self.touch[:, rows],
-            cameras={key: camera.take(rows) for key, camera in self.cameras.items()},
-            readings=None if self.readings is None else self.readings.take(rows),
-            wrench=None if self.wrench is None else self.wrench[rows],
-        )
-
-    def extended(self, later: "Sequence[EmbeddedEpisode]") -> "EmbeddedEpisode":
-        """Return this trajectory with consecutive later pieces of itself behind it."""
-        pieces = (self, *later)
-        readings = [p.readings for p in pieces if p.readings is not None]
-        wrenches = [p.wrench for p in pieces if p.wrench is not None]
-        return replace(
-            self,
-            image=None if self.image is None else np.concatenate([p.pictures() for p in pieces]),
-            touch=None if self.touch is None else np.concatenate([p.touches() for p in pieces], 1),
-            cameras={k: CameraFeatures.join([p.cameras[k] for p in pieces]) for k in self.cameras},
-            readings=ContactReadings.join(readings) if readings else None,
-            wrench=np.concatenate(wrenches) if wrenches else None,
-        )
+        return replace(self, features=take_rows(self.features, rows))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EmbeddedGoal:
-    """Goals of a trajectory as features, one or several (g) for each modality that has any.
+    """Goals of a trajectory as features, one or several for each modality that has any.
 
     The nearest of several counts most (`soft_minimum`).
     """
 
-    forms: Mapping[str, str]  # the goals as a user writes them, by modality
-    same_episode: frozenset[str]  # modalities whose goal is the trajectory's own frame
-    image: Float32[np.ndarray, "g d"] | None = None
-    touch: Float32[np.ndarray, "sides g k"] | None = None
-    text: Float32[np.ndarray, "g k"] | None = None
-    text_baseline: Float32[np.ndarray, "b k"] | None = None  # of the baseline sentence, if any
-    cameras: Mapping[str, CameraFeatures] = field(default_factory=dict)
-    readings: ContactReadings | None = None
-    wrench: Float32[np.ndarray, "g 6"] | None = None
-
-    def as_frames(self) -> EmbeddedEpisode:
-        """Return the goals as the frames of an episode."""
-        return EmbeddedEpisode(
-            source="goals",
-            fps=1.0,
-            contact=Contact(None, "not looked for"),
-            made_with=EmbeddingSource("", ""),
-            image=self.image,
-            touch=self.touch,
-            cameras=self.cameras,
-            readings=self.readings,
-            wrench=self.wrench,
-        )
+    features: Features
+    forms: Mapping[str, str] = field(default_factory=dict)  # by modality, as a user writes them
+    same_episode: frozenset[str] = (
+        frozenset()
+    )  # modalities whose goal is the trajectory's own frame
 
 
-def goal_at_every_frame(frames: EmbeddedEpisode) -> EmbeddedGoal:
-    """Return an embedding's frames as goals of image and touch."""
-    return EmbeddedGoal(
-        forms={},
-        same_episode=frozenset(),
-        image=frames.image,
-        touch=frames.touch,
-        cameras=frames.cameras,
-        readings=frames.readings,
-        wrench=frames.wrench,
-    )
+def take_rows(features: Features, rows: slice | np.ndarray) -> Features:
+    """Return the features of some frames."""
+    return {name: values[rows] for name, values in features.items()}
+
+
+def join_rows(pieces: Sequence[Features]) -> Features:
+    """Return the features of several pieces, one after the other."""
+    if len(pieces) == 1:
+        return pieces[0]
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+
+def last_rows(episodes: Iterable[EmbeddedEpisode]) -> Features:
+    """Return the features of the last frame of each of some episodes that were embedded alike."""
+    return join_rows([take_rows(e.features, slice(len(e) - 1, None)) for e in episodes])
+
+
+def split_features(features: Features) -> tuple[Features, Features]:
+    """Return the features that a goal of images sets, and those that a goal of touch sets."""
+    touched = {name: values for name, values in features.items() if name in _TOUCHED}
+    return {k: v for k, v in features.items() if k not in _TOUCHED}, touched
+
+
+def cameras_of(features: Features) -> list[str]:
+    """Return the names of the cameras that have pooled features of their own."""
+    others = (IMAGE, TEXT, TEXT_BASELINE, *_TOUCHED)
+    return [name for name in features if name not in others and not name.endswith(_MAP)]
+
+
+def camera_name(key: str) -> str:
+    """Return the part of a camera: "wrist" for "observation.images.wrist"."""
+    return key.removeprefix(IMAGE_PREFIX)
+
+
+def map_name(camera: str) -> str:
+    """Return the part that is the feature map of a camera, by its key or name."""
+    return camera_name(camera) + _MAP
+
+
+def save_features(path: Path, features: Features, about: Mapping[str, Any]) -> None:
+    """Write features, and facts as JSON, to an npz file, atomically."""
+    with atomic_write(path) as unfinished, unfinished.open("wb") as file:
+        arrays: dict[str, Any] = dict(features)
+        np.savez(file, about=np.array(json.dumps(about)), **arrays)
+
+
+def load_features(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read what `save_features` wrote; ValueError: it is another file, or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            features = dict(stored)
+        return features, json.loads(str(features.pop("about")))
+    except (OSError, KeyError, TypeError, BadZipFile) as error:
+        raise ValueError(f"{path} holds no features") from error

@@ -1,51 +1,66 @@
-"""Embedding of trajectories and goals with frozen encoders."""
+"""Embedding of trajectories and goals with frozen encoders, in one go or piece by piece."""
 
 import hashlib
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import cached_property
 from itertools import chain
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.features import FRONT, TACTILE, TRUTH_CONTACT
+from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT, WRENCH
 from touchgoal.control.tactile.picture_guard import check_untouched
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.pretrained import AnyTouchEncoder
-from touchgoal.encoders.towers.towers import MapTowers, Towers
-from touchgoal.episodes.schema import Episode, is_camera
+from touchgoal.encoders.towers.towers import MapTowers, OfflineTowers, Towers
+from touchgoal.episodes.schema import Episode, MetaValue, is_camera
 from touchgoal.episodes.touches import touch_background
-from touchgoal.rewards.curves import ContactSearch
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
-from touchgoal.rewards.features.embedded import CameraFeatures, EmbeddedEpisode, EmbeddedGoal
-from touchgoal.rewards.features.feature_stream import FeatureStream, Frames
+from touchgoal.rewards.features.contact_reading import ContactReader, ContactSearch
+from touchgoal.rewards.features.embedded import (
+    IMAGE,
+    TEXT,
+    TEXT_BASELINE,
+    TOUCH,
+    EmbeddedEpisode,
+    EmbeddedGoal,
+    Features,
+    camera_name,
+    join_rows,
+    last_rows,
+    map_name,
+    split_features,
+    take_rows,
+)
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.goals import (
     Bank,
     EpisodeEnd,
     Goal,
     GoalFile,
-    GoalPicture,
-    GoalSpec,
+    GoalImage,
+    ImageGoal,
     OwnFrame,
-    PictureGoal,
     Sentence,
     TouchGoal,
     frame_index,
+    missing_camera,
 )
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
+
+Frames = Mapping[str, np.ndarray]
+"""Frames by key, (n, ...) each; keys other than cameras, fingertips and wrench are ignored."""
 
 
 class EpisodeEmbedder:
     """Embeds trajectories and goals with frozen encoders.
 
     The background of each fingertip is the median of the episode's first 5 frames, which must be
-    free of contact. While `with_parts` is true it embeds everything that the parts of a cost need:
-    both cameras, their maps, and the contact of the fingertips; otherwise one camera and touch.
+    free of contact.
     """
 
     def __init__(
@@ -53,6 +68,7 @@ class EpisodeEmbedder:
         towers: Towers,
         encoder: AnyTouchEncoder | None,
         camera: str = FRONT,
+        parts: bool = True,
     ) -> None:
         """Take the encoders.
 
@@ -61,46 +77,44 @@ class EpisodeEmbedder:
         Args:
             encoder: touch encoder (put into evaluation mode), which takes sentences if it was aligned
                 with these towers; None to measure images alone.
-            camera: key of the camera whose images are measured; "" for a plain video's.
+            camera: key of the camera whose images are measured; "" without images.
+            parts: embed everything that the parts of a cost need: both cameras, their maps, and the
+                contact of the fingertips; else one camera and touch.
         """
         self._towers = towers
         self.encoder = encoder
         self._aligned = encoder if encoder is not None and encoder.towers else None
         self.knows_words = self._aligned is not None  # touch can be compared with sentences
-        self.camera = camera
-        self.with_parts = True
+        self.camera, self.parts = camera, parts
         self._ends: dict[Bank | GoalFile, SuccessfulEnds] = {}
+        self._goals: dict[
+            tuple[EpisodeEnd, tuple[str, ...]], Features
+        ] = {}  # by keys that are read
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
-        self._pictures_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
-        self.made_with = self._pictures_with  # of episodes with touch, if there is an encoder
+        self._images_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
+        self.made_with = self._images_with  # of episodes with touch, if there is an encoder
         if encoder is not None:
             if self._aligned is not None:
                 self._aligned.check_towers(towers)
             encoder.eval()
-            self.made_with = replace(
-                self._pictures_with,
-                encoder=_weights_hash(encoder),
-                sensor=encoder.config.sensor or "",
-            )
+            hashed, sensor = _weights_hash(encoder), encoder.config.sensor or ""
+            self.made_with = replace(self._images_with, encoder=hashed, sensor=sensor)
 
-    @property
-    def past_frames(self) -> int:
-        """Number of earlier frames that the embedding of a frame depends on."""
-        return 0 if self.encoder is None else max(self.encoder.offsets)
+    @cached_property
+    def fingerprint(self) -> list[str]:
+        """All that an embedding depends on beside the frames: weights, preprocessor, camera, parts."""
+        towers = self._towers
+        weights = towers.image_weights if isinstance(towers, OfflineTowers) else towers.name
+        return [*asdict(self.made_with).values(), weights.rpartition("#")[2], str(self.parts)]
 
-    def embed_episode(
-        self, episode: Episode, fps: float, source: str, descriptions: bool = False
-    ) -> EmbeddedEpisode:
-        """Embed an episode's cameras and fingertips; on request the sentences about it, too.
+    def embed_episode(self, episode: Episode, fps: float, source: str) -> EmbeddedEpisode:
+        """Embed an episode's cameras and fingertips.
 
-        UserError: the episode lacks the camera, starts in contact, or has descriptions that are no
-        list of sentences.
+        UserError: the episode lacks the camera, or starts in contact.
         """
-        return self.embed_chunks([episode], fps, source, descriptions)
+        return self.embed_chunks([episode], fps, source)
 
-    def embed_chunks(
-        self, chunks: Iterable[Episode], fps: float, source: str, descriptions: bool = False
-    ) -> EmbeddedEpisode:
+    def embed_chunks(self, chunks: Iterable[Episode], fps: float, source: str) -> EmbeddedEpisode:
         """Embed consecutive chunks of one episode, as `embed_episode` embeds it in one go.
 
         The first chunk has at least 5 frames, unless it is the whole episode.
@@ -113,19 +127,25 @@ class EpisodeEmbedder:
                 f"{source} starts in contact, so its fingertips have no background; record it "
                 f"with {START_FRAMES} frames before the first touch"
             )
-        stream, search = self.stream(first.frames, fps, source), ContactSearch()
-        pieces = []
+        stream, search, pieces = self.stream(first.frames, fps, source), ContactSearch(), []
         for chunk in chain([first], following):
             search.update(chunk)
             pieces.append(stream.embed(chunk.frames))
-        success = first.meta.get("success")
-        return replace(
-            pieces[0].extended(pieces[1:]),
-            contact=search.contact,
-            descriptions=self._embed_descriptions(first, source) if descriptions else None,
-            object=str(first.meta.get("object", "")),
-            success=None if success is None else bool(success),
-        )
+        features = join_rows([piece.features for piece in pieces])
+        embedded = replace(pieces[0], features=features, contact=search.contact)
+        return embedded.with_facts(first.meta)
+
+    def describe(self, embedded: EmbeddedEpisode, meta: Mapping[str, MetaValue]) -> EmbeddedEpisode:
+        """Add the sentences about an episode, if touch knows words.
+
+        UserError: its descriptions are no list of sentences.
+        """
+        sentences = meta.get("descriptions", [])
+        if not isinstance(sentences, list):
+            raise UserError(f"{embedded.source}: meta descriptions must be a list of sentences")
+        if not sentences or self._aligned is None:
+            return embedded
+        return replace(embedded, descriptions=self.embed_sentences(sentences))
 
     def stream(self, first: Frames, fps: float, source: str) -> "FeatureStream":
         """Return a stream that embeds a trajectory piece by piece, as `embed_episode` in one go.
@@ -142,12 +162,10 @@ class EpisodeEmbedder:
         for side in sides:
             if sensor is not None:
                 check_untouched(touch_background(first[side]), sensor, f"{side} of {source}")
-        # one class by two paths
-        return FeatureStream(self, first, sides, fps, source)  # pyright: ignore[reportArgumentType]
-
-    def source_of(self, sides: Sequence[str]) -> EmbeddingSource:
-        """Return what embeddings of a trajectory with these fingertips are made with."""
-        return self.made_with if sides else self._pictures_with
+        about = EmbeddedEpisode(
+            {}, self.made_with if sides else self._images_with, source, fps, sides
+        )
+        return FeatureStream(self, first, about)
 
     def _sides(self, frames: Frames) -> tuple[str, ...]:
         return tuple(key for key in TACTILE if key in frames) if self.encoder else ()
@@ -155,30 +173,34 @@ class EpisodeEmbedder:
     def embed_goal(self, goal: Goal, own: EmbeddedEpisode) -> EmbeddedGoal:
         """Embed a goal for one trajectory; frames of `own` are not embedded again.
 
-        UserError: a frame beyond the trajectory, an unreadable picture or episode, or an episode
+        UserError: a frame beyond the trajectory, an unreadable image or episode, or an episode
         with other fingertips.
         """
-        embedded = EmbeddedGoal(goal.as_dict(), goal.same_episode)
+        features: dict[str, np.ndarray] = {}
         if goal.image is not None:
-            embedded = replace(embedded, **self._goal_pictures(goal.image, own))
+            features |= self._goal_of_images(goal.image, own)
         if goal.tactile is not None:
-            embedded = replace(embedded, **self._goal_touches(goal.tactile, own))
+            features |= self._goal_of_touch(goal.tactile, own)
         if goal.text is not None:
-            sentences = [s for s in (goal.text.text, goal.text.baseline) if s]
-            text = self.embed_sentences(sentences)
-            embedded = replace(embedded, text=text[:1], text_baseline=text[1:])
-        return embedded
+            features[TEXT] = self.embed_sentences([goal.text.text])
+            if goal.text.baseline:
+                features[TEXT_BASELINE] = self.embed_sentences([goal.text.baseline])
+        return EmbeddedGoal(features, goal.as_dict(), goal.same_episode)
 
-    def embed_camera(self, frames: UInt8[np.ndarray, "n h w 3"]) -> CameraFeatures:
-        """Return features of one camera's images: with a map if parts are wanted."""
-        if not self.with_parts or not isinstance(self._towers, MapTowers):
-            return CameraFeatures(self.embed_pictures(frames))
-        pooled, maps = self._towers.embed_with_maps(frames)
-        return CameraFeatures(_unit(pooled), maps)
-
-    def embed_pictures(self, frames: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, "n d"]:
-        """Return unit embeddings of camera images."""
-        return _unit(self._towers.embed_images(frames))
+    def embed_cameras(self, frames: Frames) -> Features:
+        """Return image, and with parts the pooled features and map of each camera."""
+        if not self.parts:
+            return {IMAGE: self._embed_images(frames[self.camera])} if self.camera in frames else {}
+        features: dict[str, np.ndarray] = {}
+        for key in dict.fromkeys((*CAMERAS, self.camera)):
+            if key in frames and isinstance(self._towers, MapTowers):
+                pooled, features[map_name(key)] = self._towers.embed_with_maps(frames[key])
+                features[camera_name(key)] = _unit(pooled)
+            elif key in frames:
+                features[camera_name(key)] = self._embed_images(frames[key])
+        if self.camera in frames:
+            features[IMAGE] = features[camera_name(self.camera)]
+        return features
 
     def embed_touch(
         self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
@@ -199,87 +221,101 @@ class EpisodeEmbedder:
         assert self._aligned is not None  # without it no modality takes a sentence
         return self._aligned.embed_text_goal(list(sentences), self._towers)
 
-    def _goal_pictures(self, spec: PictureGoal, own: EmbeddedEpisode) -> dict[str, Any]:
-        """Return the fields of an `EmbeddedGoal` that the goal of the pictures sets."""
+    def _embed_images(self, frames: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, "n d"]:
+        return _unit(self._towers.embed_images(frames))
+
+    def _goal_of_images(self, spec: ImageGoal, own: EmbeddedEpisode) -> Features:
         main = self.camera or FRONT
         if isinstance(spec, Sentence):
-            assert self._towers.pretrained_together  # or a sentence is no goal for pictures
-            return {"image": _unit(self._towers.embed_texts([spec.text]))}
-        if isinstance(spec, GoalPicture):
-            cameras = {main: self.embed_camera(spec.read())}
-            return {"image": cameras[main].pooled, "cameras": cameras}
-        if isinstance(spec, Bank | GoalFile):
-            end = self._successful_ends(spec, own).for_trajectory(own, str(spec))
-            return {"image": end.image, "cameras": end.cameras}
+            assert self._towers.pretrained_together  # or a sentence is no goal for images
+            return {IMAGE: _unit(self._towers.embed_texts([spec.text]))}
+        if isinstance(spec, GoalImage):
+            return self.embed_cameras({main: spec.read()})
         if isinstance(spec, EpisodeEnd):
-            frames = spec.read(tuple(own.cameras) or (main,)).frames
-            cameras = {k: self.embed_camera(v[-1:]) for k, v in frames.items() if is_camera(k)}
-            return {"image": cameras[main].pooled, "cameras": cameras}
-        end = own.take(_one(frame_index(spec, len(own), own.source)))
-        return {"image": end.pictures(), "cameras": end.cameras}
+            seen = [key for key in (*CAMERAS, main) if camera_name(key) in own.features]
+            key = spec, tuple(dict.fromkeys(seen)) or (main,)
+            if key not in self._goals:
+                frames = spec.read(key[1]).frames
+                last = {k: v[-1:] for k, v in frames.items() if is_camera(k)}
+                self._goals[key] = self.embed_cameras(last)
+            return self._goals[key]
+        return split_features(self._end(spec, own))[0]
 
-    def _goal_touches(self, spec: TouchGoal, own: EmbeddedEpisode) -> dict[str, Any]:
-        """Return the fields of an `EmbeddedGoal` that the goal of touch sets."""
+    def _goal_of_touch(self, spec: TouchGoal, own: EmbeddedEpisode) -> Features:
+        if isinstance(spec, OwnFrame | Bank | GoalFile):
+            return split_features(self._end(spec, own))[1]
+        if isinstance(spec, EpisodeEnd):
+            key = spec, own.sides
+            if key not in self._goals:
+                read = replace(spec.read(own.sides), meta={})
+                embedded = self.embed_episode(read, own.fps, str(spec))
+                self._goals[key] = split_features(last_rows([embedded]))[1]
+            return self._goals[key]
+        frames = {
+            side: np.stack([*[spec.backgrounds[side]] * START_FRAMES, spec.images[side]])
+            for side in own.sides
+        }
+        end = self.stream(frames, own.fps, str(spec)).embed(frames)
+        return split_features(last_rows([end]))[1]
+
+    def _end(self, spec: OwnFrame | Bank | GoalFile, own: EmbeddedEpisode) -> Features:
+        """Return a frame of the trajectory, or the ends of successes, which are embedded once."""
         if isinstance(spec, OwnFrame):
-            end = own.take(_one(frame_index(spec, len(own), own.source)))
-        elif isinstance(spec, Bank | GoalFile):
-            end = self._successful_ends(spec, own).for_trajectory(own, str(spec))
-        elif isinstance(spec, EpisodeEnd):
-            read = spec.read(own.sides)
-            end = self.embed_episode(replace(read, meta={}), own.fps, str(spec))
-            end = end.take(_one(len(end) - 1))
-        else:
-            frames = {
-                side: np.stack([*[spec.backgrounds[side]] * START_FRAMES, spec.pictures[side]])
-                for side in own.sides
-            }
-            end = self.stream(frames, own.fps, str(spec)).embed(frames).take(_one(START_FRAMES))
-        return {"touch": end.touch, "readings": end.readings, "wrench": end.wrench}
-
-    def _successful_ends(self, spec: Bank | GoalFile, own: EmbeddedEpisode) -> SuccessfulEnds:
-        """Return the ends of a bank, embedded once; UserError if they were embedded otherwise."""
+            row = frame_index(spec, len(own), own.source)
+            return take_rows(own.features, slice(row, row + 1))
         if spec not in self._ends:
-            if isinstance(spec, GoalFile):
-                ends = SuccessfulEnds.load(spec.path)
-            else:
-                wanted = (*own.cameras, *((self.camera,) if self.camera else ()), *own.sides)
-                keys = tuple(dict.fromkeys(wanted))
-                ends = SuccessfulEnds.of(
-                    [self.embed_episode(e.read(keys), own.fps, str(e)) for e in spec.ends()]
-                )
-            self._ends[spec] = ends
-        ends = self._ends[spec]
-        if (reason := ends.frames.made_with.mismatch(own.made_with)) is not None:
-            raise UserError(f"goal '{spec}' does not fit {own.source}: {reason}")
-        return ends
+            self._ends[spec] = self._embed_ends(spec, own)
+        return self._ends[spec].for_trajectory(own, str(spec))
 
-    def _embed_descriptions(
-        self, episode: Episode, source: str
-    ) -> Float32[np.ndarray, "m k"] | None:
-        sentences = episode.meta.get("descriptions", [])
-        if not isinstance(sentences, list):
-            raise UserError(f"{source}: meta descriptions must be a list of sentences")
-        return self.embed_sentences(sentences) if sentences and self._aligned else None
-
-
-def check_words(specs: Iterable[GoalSpec], encoder: AnyTouchEncoder | None) -> None:
-    """Raise UserError if a goal is a sentence and the touch encoder was not aligned with texts."""
-    sentences = [spec for spec in specs if isinstance(spec, Sentence)]
-    if sentences and encoder is not None and encoder.towers is None:
-        raise UserError(
-            f"goal '{sentences[0]}': this touch encoder was not aligned with texts: leave the goal "
-            "out, or take an encoder of train-encoder align"
+    def _embed_ends(self, spec: Bank | GoalFile, own: EmbeddedEpisode) -> SuccessfulEnds:
+        if isinstance(spec, GoalFile):
+            return SuccessfulEnds.load(spec.path)
+        seen = [key for key in CAMERAS if camera_name(key) in own.features]
+        keys = dict.fromkeys((*seen, *((self.camera,) if self.camera else ()), *own.sides))
+        return SuccessfulEnds.of(
+            [self.embed_episode(e.read(tuple(keys)), own.fps, str(e)) for e in spec.ends()]
         )
 
 
-def _one(row: int) -> slice:
-    return slice(row, row + 1)
+class FeatureStream:
+    """Embeds consecutive frames of one trajectory; pieces of any length give the same features."""
 
+    def __init__(self, embedder: EpisodeEmbedder, first: Frames, about: EmbeddedEpisode) -> None:
+        """Take the background of the fingertips from the first frames; see `embedder.stream`."""
+        self._embedder, self._about = embedder, about
+        untouched = {side: first[side][:START_FRAMES] for side in about.sides}
+        self._backgrounds = {side: touch_background(frames) for side, frames in untouched.items()}
+        sensor = SENSORS.get(embedder.made_with.sensor)
+        # newest frames of each side, for encoders of several
+        self._past: dict[str, np.ndarray] = {}
+        self._readers = {
+            side: ContactReader(sensor, frames, about.fps)
+            for side, frames in untouched.items()
+            if embedder.parts
+        }
 
-def missing_camera(source: str, camera: str, cameras: Sequence[str]) -> str:
-    """Return the message for a source that lacks a camera."""
-    there = f"choose --camera {' or '.join(cameras)}" if cameras else "it has no camera"
-    return f"{source} has no images of {camera}: {there}"
+    def embed(self, frames: Frames) -> EmbeddedEpisode:
+        """Embed the next frames; the first contact is not looked for."""
+        features = dict(self._embedder.embed_cameras(frames))
+        sides = self._about.sides
+        if sides:
+            features[TOUCH] = np.stack([self._embed_touch(s, frames[s]) for s in sides], axis=1)
+        if self._readers:
+            readings = [reader.read(frames[side]) for side, reader in self._readers.items()]
+            features |= {k: np.stack([r[k] for r in readings], axis=1) for k in readings[0]}
+        if self._embedder.parts and WRENCH in frames:
+            features["wrench"] = frames[WRENCH]
+        return replace(self._about, features=features)
+
+    def _embed_touch(
+        self, side: str, frames: UInt8[np.ndarray, "n h w 3"]
+    ) -> Float32[np.ndarray, "n k"]:
+        encoder = self._embedder.encoder
+        assert encoder is not None  # without it there are no sides
+        past = self._past.get(side, frames[:0])
+        known = np.concatenate([past, frames]) if len(past) else frames
+        self._past[side] = known[len(known) - max(encoder.offsets) :]
+        return self._embedder.embed_touch(known, self._backgrounds[side])[len(past) :]
 
 
 def _unit(embeddings: torch.Tensor) -> Float32[np.ndarray, "n d"]:

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: pictures and curves that scrub together, and a table of all trajectories.
+"""Self-contained HTML pages: images and curves that scrub together, and a table of all trajectories.
 
 Up to 100 trajectories are one page; more are pages of 100 and an index. No network is needed.
 """
@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from touchgoal.rewards.curves import PLAIN, main_curve, reference_levels
-from touchgoal.rewards.distance.parts import FUSED
+from touchgoal.rewards.curves import main_curve, reference_levels
 from touchgoal.rewards.report.record import Facts, Record
-from touchgoal.rewards.report.summary import COLUMNS
+from touchgoal.rewards.report.tables import COLUMNS
 from touchgoal.rewards.report.thumbnails import COLUMNS as SHEET_COLUMNS
 from touchgoal.rewards.report.thumbnails import last_of
 from touchgoal.runtime.atomic_write import write_file
@@ -109,8 +108,6 @@ def _content(facts: Sequence[Facts], episodes: Sequence[Mapping[str, Any]]) -> d
     return {
         "curves": names,
         "main": main_curve(names),
-        # beside the parts, the plain distances are for comparison
-        "hidden": [name for name in names if name in PLAIN] if FUSED in names else [],
         "levels": reference_levels(names, facts[0].normalised),
         "columns": [*used, {"key": "frames", "label": "frames", "digits": 0}, *metrics],
         "episodes": episodes,
@@ -133,7 +130,7 @@ def _row(facts: Facts) -> dict[str, Any]:
 
 
 def _viewed(record: Record) -> dict[str, Any]:
-    """Return a row with curves and pictures."""
+    """Return a row with curves and images."""
     facts = record.facts
     at = np.linspace(0, facts.frames - 1, min(facts.frames, _MOST_POINTS)).round().astype(int)
     return _row(facts) | {

@@ -8,8 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from touchgoal.episodes.film import BLACK, COLORS
-from touchgoal.rewards.curves import PLAIN, Curves, main_curve, reference_levels
-from touchgoal.rewards.distance.parts import FUSED
+from touchgoal.rewards.curves import FUSED, GAMMA, Curves, main_curve, reference_levels
 
 _DASHES = ((0, (5, 2)), (0, (1.5, 1.5)), (0, (5, 1.5, 1.5, 1.5)), "-", (0, (3, 1)), (0, (8, 2)))
 _SINGLE = tuple(color for color in COLORS if color != BLACK)
@@ -18,20 +17,19 @@ _PANELS = ((0.53, 0.345), (0.275, 0.17), (0.06, 0.15))  # bottom and height of e
 _LABEL_GAP = 0.06  # least distance between two curve labels, share of the first panel's height
 
 
-def draw(curves: Curves, gamma: float) -> Figure:
-    """Return a figure of costs, state rewards and potential-based rewards over time.
+def plot(curves: Curves, gamma: float = GAMMA) -> Figure:
+    """Return a figure of costs and rewards over time: `plot(curves).savefig("curves.png")`.
 
-    The first contact and the reference levels are marked. With parts, the plain distances are left
-    out, and the rewards are those of the fused cost.
+    The first contact and the reference levels are marked. With parts, the rewards are those of the
+    fused cost.
     """
     costs = curves.costs
     main = main_curve(costs)
-    drawn = [name for name in costs if name not in PLAIN] if main == FUSED else list(costs)
-    rewarded = [main] if main == FUSED else drawn
+    rewarded = [main] if main == FUSED else list(costs)
     panels = (
         (
             "distance to goal (cost, normalised)" if curves.normalised else f"cost: {curves.unit}",
-            {name: costs[name] for name in drawn},
+            costs,
         ),
         ("state reward\n= -cost", {name: curves.rewards[name] for name in rewarded}),
         (

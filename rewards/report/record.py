@@ -5,7 +5,6 @@ are those of an uninterrupted one.
 """
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ _COLUMN, _SHEET = "column/", "sheet/"
 
 @dataclass(frozen=True)
 class Facts:
-    """Everything about a measured trajectory but its values per frame and its pictures."""
+    """Everything about a measured trajectory but its values per frame and its images."""
 
     name: str  # file name of its reports
     source: str  # name for people
@@ -45,7 +44,7 @@ class Facts:
     success: bool | None  # None if unknown
     measured: dict[str, dict[str, Any]]  # metrics of each cost curve, see CurveMetrics
     peaks: dict[str, list[int]]  # frames of the bumps of each cost curve
-    shown: list[int]  # frames that the pictures show
+    shown: list[int]  # frames that the images show
     columns: list[str]  # names of the values per frame
 
     def metrics(self) -> dict[str, CurveMetrics]:
@@ -92,13 +91,11 @@ def load_facts(path: Path) -> Facts:
         return Facts(**json.loads(str(file["facts"])))
 
 
-def record_of(
-    curves: Curves, trajectory: Trajectory, thumbnails: Thumbnails, gamma: float
-) -> Record:
+def record_of(curves: Curves, trajectory: Trajectory, thumbnails: Thumbnails) -> Record:
     """Return the record of a measured trajectory."""
     meta, metrics = trajectory.meta, curves.metrics()
     success = meta.get("success")
-    columns = columns_of(curves, gamma)
+    columns = columns_of(curves)
     facts = Facts(
         name=trajectory.name,
         source=curves.source,
@@ -123,12 +120,12 @@ def record_of(
     return Record(facts, columns, thumbnails.sheets())
 
 
-def columns_of(curves: Curves, gamma: float) -> dict[str, Float[np.ndarray, " n"]]:
+def columns_of(curves: Curves) -> dict[str, Float[np.ndarray, " n"]]:
     """Return all values per frame: costs, both forms of reward, raw distances."""
-    groups: dict[str, Mapping[str, np.ndarray]] = {
+    groups = {
         COST: curves.costs,
         REWARD: curves.rewards,
-        POTENTIAL: curves.potential_rewards(gamma),
+        POTENTIAL: curves.potential_rewards(),
         RAW: curves.raw,
     }
     return {

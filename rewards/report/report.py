@@ -12,11 +12,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from touchgoal.rewards.curves import GAMMA, Curves
 from touchgoal.rewards.report.frame_table import PROGRESS, write_frames, write_progress
-from touchgoal.rewards.report.outcome_table import outcome_table
 from touchgoal.rewards.report.page import write_pages
+from touchgoal.rewards.report.plot import plot
 from touchgoal.rewards.report.record import Facts, columns_of, load_facts
-from touchgoal.rewards.report.success_table import success_table
-from touchgoal.rewards.report.summary import metrics_table
+from touchgoal.rewards.report.tables import metrics_table, outcome_table, success_table
 from touchgoal.rewards.success import SuccessThreshold
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.json_file import write_json
@@ -27,20 +26,19 @@ def write_report(
     folder: Path,
     name: str,
     provenance: Mapping[str, Any],
-    gamma: float = GAMMA,
-    plot: bool = True,
+    with_plot: bool = True,
 ) -> dict[str, Path]:
     """Write NAME.csv, NAME.json and, on request, NAME.png, each atomically; return the paths by kind.
 
     The JSON also holds what the curves were made with (encoder, towers, command).
     """
     contents = {
-        "csv": curves_csv(curves, gamma).encode(),
-        "json": (json.dumps(report_json(curves, provenance, gamma), indent=2) + "\n").encode(),
+        "csv": curves_csv(curves).encode(),
+        "json": (json.dumps(report_json(curves, provenance), indent=2) + "\n").encode(),
     }
-    if plot:
+    if with_plot:
         png = io.BytesIO()
-        FigureCanvasAgg(curves.plot(gamma)).print_png(png, metadata={"Software": None})
+        FigureCanvasAgg(plot(curves)).print_png(png, metadata={"Software": None})
         contents["png"] = png.getvalue()
     paths = {kind: folder / f"{name}.{kind}" for kind in contents}
     for kind, path in paths.items():
@@ -88,9 +86,7 @@ def write_metrics(facts: Sequence[Facts], out: Path) -> None:
     write_json(out / "metrics.json", rows)
 
 
-def report_json(
-    curves: Curves, provenance: Mapping[str, Any], gamma: float = GAMMA
-) -> dict[str, Any]:
+def report_json(curves: Curves, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Return metrics, costs and rewards of every curve, and how they were made, ready for JSON."""
     return {
         "source": curves.source,
@@ -104,8 +100,8 @@ def report_json(
         "state_reward": {"definition": "-cost", "values": _rounded(curves.rewards)},
         "potential_reward": {
             "definition": "g Phi(frame) - Phi(frame before), g = gamma^(1 / fps), Phi = -cost",
-            "gamma": gamma,
-            "values": _rounded(curves.potential_rewards(gamma)),
+            "gamma": GAMMA,
+            "values": _rounded(curves.potential_rewards()),
         },
         "goal_is_own_frame": sorted(curves.same_episode),
         "provenance": dict(provenance),
@@ -116,13 +112,13 @@ def _rounded(curves: Mapping[str, np.ndarray]) -> dict[str, list[float]]:
     return {name: np.round(values, 6).tolist() for name, values in curves.items()}
 
 
-def curves_csv(curves: Curves, gamma: float = GAMMA) -> str:
+def curves_csv(curves: Curves) -> str:
     """Return a CSV with a row per frame.
 
     Columns: frame, time (s); for every curve `cost_`, `reward_` (-cost) and `potential_reward_`
     (see `report_json`); `cosine_distance_` of every single modality.
     """
-    columns = columns_of(curves, gamma)
+    columns = columns_of(curves)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["frame", "time_s", *columns])

@@ -1,8 +1,8 @@
-"""Small pictures of a trajectory, at most 32 frames of 96 px, collected while it is read."""
+"""Small images of a trajectory, at most 32 frames of 96 px, collected while it is read."""
 
 import io
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from touchgoal.episodes.schema import Episode, is_image
 
 MOST_FRAMES = 32
 WIDTH = 96  # px
-COLUMNS = 8  # pictures in a row of a sheet
+COLUMNS = 8  # images in a row of a sheet
 _QUALITY = 70  # of JPEG
 
 
@@ -24,32 +24,39 @@ class Thumbnails:
     def __init__(self, length: int) -> None:
         """Plan for a trajectory of so many frames."""
         count = min(length, MOST_FRAMES)
-        self._planned: list[int] = np.linspace(0, length - 1, count).round().astype(int).tolist()
-        self._pictures: dict[str, list[np.ndarray]] = {}
+        self.planned: list[int] = np.linspace(0, length - 1, count).round().astype(int).tolist()
+        self._images: dict[str, list[np.ndarray]] = {}
 
     @property
     def shown(self) -> list[int]:
         """The frames that were collected; fewer than planned where a video ended early."""
-        return self._planned[: len(next(iter(self._pictures.values()), []))]
+        return self.planned[: len(next(iter(self._images.values()), []))]
 
     def collect(self, chunks: Iterable[Episode]) -> Iterator[Episode]:
         """Pass consecutive chunks of the trajectory on."""
         start = 0
         for chunk in chunks:
-            rows = [t - start for t in self._planned if start <= t < start + len(chunk)]
-            for key in filter(is_image, chunk.frames):
-                small = [_shrunk(chunk.frames[key][row]) for row in rows]
-                self._pictures.setdefault(key.removeprefix(IMAGE_PREFIX), []).extend(small)
+            rows = [t - start for t in self.planned if start <= t < start + len(chunk)]
+            self._add({key: chunk.frames[key][rows] for key in filter(is_image, chunk.frames)})
             start += len(chunk)
             yield chunk
 
+    def add(self, planned: Episode) -> None:
+        """Add the planned frames, where the trajectory is not read as a whole."""
+        self._add({key: planned.frames[key] for key in filter(is_image, planned.frames)})
+
+    def _add(self, frames: Mapping[str, UInt8[np.ndarray, "n h w 3"]]) -> None:
+        for key, images in frames.items():
+            name = key.removeprefix(IMAGE_PREFIX)
+            self._images.setdefault(name, []).extend(_shrunk(image) for image in images)
+
     def sheets(self) -> dict[str, UInt8[np.ndarray, " bytes"]]:
         """Return a JPEG of each camera and fingertip: its frames in rows of 8, from the top left."""
-        return {name: _sheet(pictures) for name, pictures in self._pictures.items()}
+        return {name: _sheet(images) for name, images in self._images.items()}
 
 
 def last_of(sheet: UInt8[np.ndarray, " bytes"], count: int) -> bytes:
-    """Return the last of the `count` pictures of a sheet as a JPEG of its own."""
+    """Return the last of the `count` images of a sheet as a JPEG of its own."""
     with Image.open(io.BytesIO(sheet.tobytes())) as image:
         height = image.height // math.ceil(count / COLUMNS)
         row, column = divmod(count - 1, COLUMNS)
@@ -58,22 +65,22 @@ def last_of(sheet: UInt8[np.ndarray, " bytes"], count: int) -> bytes:
         return _jpeg(np.asarray(image.crop(box)))
 
 
-def _shrunk(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "y x 3"]:
-    height = max(round(WIDTH * picture.shape[0] / picture.shape[1]), 1)
-    return np.asarray(cv2.resize(picture, (WIDTH, height), interpolation=cv2.INTER_AREA))
+def _shrunk(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "y x 3"]:
+    height = max(round(WIDTH * image.shape[0] / image.shape[1]), 1)
+    return np.asarray(cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA))
 
 
-def _sheet(pictures: list[np.ndarray]) -> UInt8[np.ndarray, " bytes"]:
-    height, width, _ = pictures[0].shape
-    columns, rows = min(len(pictures), COLUMNS), math.ceil(len(pictures) / COLUMNS)
+def _sheet(images: list[np.ndarray]) -> UInt8[np.ndarray, " bytes"]:
+    height, width, _ = images[0].shape
+    columns, rows = min(len(images), COLUMNS), math.ceil(len(images) / COLUMNS)
     sheet = np.zeros((rows * height, columns * width, 3), np.uint8)
-    for i, picture in enumerate(pictures):
+    for i, image in enumerate(images):
         row, column = divmod(i, COLUMNS)
-        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = picture
+        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = image
     return np.frombuffer(_jpeg(sheet), np.uint8)
 
 
-def _jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
+def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, "JPEG", quality=_QUALITY)
+    Image.fromarray(image).save(file, "JPEG", quality=_QUALITY)
     return file.getvalue()

@@ -1,4 +1,4 @@
-"""Episodes of a set as trajectories."""
+"""Episodes of a set as trajectories, and their goals where the user gives none."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,8 +13,7 @@ from touchgoal.episodes.schema import Episode, is_camera, is_image
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.rewards.distance.normalizer import scene_of
-from touchgoal.rewards.features.embedder import missing_camera
-from touchgoal.rewards.goals import Inputs
+from touchgoal.rewards.goals import Bank, GoalSpec, Inputs, OwnFrame, missing_camera
 from touchgoal.rewards.sources.trajectory import Skipped, Source, Trajectory, frames_per_chunk
 from touchgoal.runtime.errors import UserError
 
@@ -32,13 +31,16 @@ class EpisodeTrajectory(Trajectory):
         """See Trajectory."""
         return self.episodes.episode_checksum(self.index)
 
+    def read(self, frames: Sequence[int]) -> Episode:
+        """Read some frames; UserError: a file is missing or unreadable."""
+        return self.episodes.read(self.index, self.keys, frames)
+
     def chunks(self) -> Iterator[Episode]:
         """See Trajectory."""
         shapes = [self.episodes.features[key]["shape"] for key in self.keys if is_image(key)]
         size = frames_per_chunk(sum(int(np.prod(shape)) for shape in shapes))
         for start in range(0, self.length, size):
-            frames = range(start, min(start + size, self.length))
-            yield self.episodes.read(self.index, self.keys, frames)
+            yield self.read(range(start, min(start + size, self.length)))
 
 
 def open_episodes(
@@ -145,3 +147,47 @@ def _reads(episodes: EpisodeSet, i: int, keys: Sequence[str]) -> bool:
     except UserError:
         return False
     return True
+
+
+def default_goals(trajectories: Sequence[Trajectory]) -> dict[str, GoalSpec]:
+    """Return the goal of each trajectory by name, where the user gave none.
+
+    That is its own last frame. With it every failure would end at a cost of 0, so if a
+    trajectory failed, it is the nearest end of the set's other
+    successes with the same object; a success that is the only one with its object keeps its own end.
+    UserError: a failure among videos, or an object without a success.
+    """
+    failed = [t for t in trajectories if t.meta.get("success") is False]
+    if not failed:
+        return {t.name: OwnFrame() for t in trajectories}
+    episodes = [t for t in trajectories if isinstance(t, EpisodeTrajectory)]
+    if len(episodes) < len(trajectories):
+        raise UserError(
+            f"{failed[0].name} failed, and at its own last frame a failure costs 0, too: give the "
+            "end of a success, --goal image:FILE or --goal episode:SET#K"
+        )
+    successes = _successes(episodes[0].episodes)
+    return {t.name: _successful_ends(t, successes) for t in episodes}
+
+
+def _successes(episodes: EpisodeSet) -> dict[str, list[int]]:
+    """Return the successful episodes of each object."""
+    found: dict[str, list[int]] = {}
+    for i in range(len(episodes)):
+        meta = episodes.meta(i)
+        if meta.get("success"):
+            found.setdefault(str(meta.get("object", "")), []).append(i)
+    return found
+
+
+def _successful_ends(trajectory: EpisodeTrajectory, successes: Mapping[str, list[int]]) -> GoalSpec:
+    root, what = trajectory.episodes.root, str(trajectory.meta.get("object", ""))
+    same_object = successes.get(what, [])
+    if set(same_object) - {trajectory.index}:
+        return Bank(root, trajectory.episodes.keys)
+    if same_object:
+        return OwnFrame()
+    raise UserError(
+        f"failures are among the episodes, and no success of {root} has the object of "
+        f"{trajectory.source} ({what or 'unknown'}): give a goal, --goal episode:SET#K"
+    )

@@ -1,13 +1,16 @@
-"""Trajectories of a source before they are read."""
+"""Trajectories of a source before they are read, and chunks of them, read ahead by threads."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.rewards.goals import Inputs
 
 _CHUNK_BYTES = 48e6  # decoded frames in a chunk; a few chunks are in memory at once
+_THREADS = 2  # that read ahead
 _FEWEST_FRAMES = 16  # in a chunk: the first one holds the frames that give the background
 
 
@@ -51,5 +54,35 @@ class Source:
 
 
 def frames_per_chunk(frame_bytes: int) -> int:
-    """Return how many frames of this size, all pictures together, are read at once."""
+    """Return how many frames of this size, all images together, are read at once."""
     return max(int(_CHUNK_BYTES / max(frame_bytes, 1)), _FEWEST_FRAMES)
+
+
+class _ReadAhead(Iterator[Episode]):
+    """Chunks of a trajectory, of which the next one is read by a thread in the meantime."""
+
+    def __init__(self, chunks: Iterator[Episode], pool: ThreadPoolExecutor) -> None:
+        self._chunks, self._pool = chunks, pool
+        self._next: Future[Episode | None] = pool.submit(next, chunks, None)
+
+    def __next__(self) -> Episode:
+        chunk = self._next.result()
+        if chunk is None:
+            raise StopIteration
+        self._next = self._pool.submit(next, self._chunks, None)
+        return chunk
+
+
+def read_ahead(trajectories: Iterable[Trajectory]) -> Iterator[Iterator[Episode]]:
+    """Yield the chunks of each trajectory, while threads read the next ones.
+
+    At most three trajectories have a chunk in memory, and the first of them two.
+    """
+    with ThreadPoolExecutor(_THREADS) as pool:
+        waiting: deque[Iterator[Episode]] = deque()
+        for trajectory in trajectories:
+            waiting.append(_ReadAhead(trajectory.chunks(), pool))
+            if len(waiting) > _THREADS:
+                yield waiting.popleft()
+        while waiting:
+            yield waiting.popleft()

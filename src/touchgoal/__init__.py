@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from touchgoal.episodes.store import load_episodes as load_episodes
     from touchgoal.policies.checkpoint import load_policy as load_policy
     from touchgoal.policies.evaluation.evaluate import evaluate as evaluate
-    from touchgoal.rewards.api import reward_curve as reward_curve
     from touchgoal.rewards.environments import make as make
     from touchgoal.rewards.environments import make_vec as make_vec
+    from touchgoal.rewards.reward import Reward as Reward
 
 
 def _headless_opengl() -> str:
@@ -36,13 +36,13 @@ if sys.platform == "linux" and "DISPLAY" not in os.environ and "MUJOCO_GL" not i
 register_environments()
 
 _INTERFACE = {  # one call a job, imported at its first use: `import touchgoal` stays light
+    "Reward": "touchgoal.rewards.reward",
     "evaluate": "touchgoal.policies.evaluation.evaluate",
     "load_encoder": "touchgoal.encoders.pretrained",
     "load_policy": "touchgoal.policies.checkpoint",
     "load_episodes": "touchgoal.episodes.store",
     "make": "touchgoal.rewards.environments",
     "make_vec": "touchgoal.rewards.environments",
-    "reward_curve": "touchgoal.rewards.api",
 }
 
 

@@ -18,7 +18,7 @@ from benchmarks.papers.mmwand.intervals import cell, mean_over_objects
 from touchgoal.encoders.alignment.described_touches import embed_grasps
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers
-from touchgoal.rewards.report.text_table import aligned
+from touchgoal.rewards.report.tables import aligned
 from touchgoal.runtime.errors import UserError
 
 _FEWER = 10  # candidates

@@ -17,7 +17,7 @@ from benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
 from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.heads import Heads, PairedEmbeddings, fit_heads
-from touchgoal.rewards.report.text_table import aligned
+from touchgoal.rewards.report.tables import aligned
 from touchgoal.runtime.errors import UserError
 
 PUBLISHED = """published (MMWand, Table III, VisGel), top-1 and top-5 in %, seen / unseen objects:

@@ -38,7 +38,7 @@ from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
-from touchgoal.rewards.report.text_table import aligned
+from touchgoal.rewards.report.tables import aligned
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.runtime.progress import track

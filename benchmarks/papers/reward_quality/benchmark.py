@@ -40,8 +40,8 @@ from benchmarks.papers.reward_quality.recording import (
     record,
 )
 from touchgoal.rewards.audit import audit_touch
-from touchgoal.rewards.distance.parts import FUSED
-from touchgoal.rewards.report.summary import metrics_table
+from touchgoal.rewards.curves import FUSED
+from touchgoal.rewards.report.tables import metrics_table
 from touchgoal.rewards.success import check_demonstrations, fit_success
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig

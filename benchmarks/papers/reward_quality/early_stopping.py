@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.papers.reward_quality.measures import Judged
-from touchgoal.rewards.distance.parts import FUSED
-from touchgoal.rewards.online.failure_watch import FailureWatch
+from touchgoal.rewards.curves import FUSED
+from touchgoal.rewards.online import FailureWatch
 
 _RISES = np.arange(0.02, 1.0, 0.01)
 

@@ -64,10 +64,6 @@ def _embed(files: EmbeddedFiles, recorded: Recorded) -> bytes:
     i, embedder = recorded.index, load_embedder(files.encoder)
     keys = [key for key in (*CAMERAS, *TACTILE, TRUTH_CONTACT, WRENCH) if key in episodes.features]
     frames = range((episodes.lengths[i] - 1) % files.every, episodes.lengths[i], files.every)
-    embedded = embedder.embed_episode(
-        episodes.read(i, keys, frames),
-        episodes.fps / files.every,
-        f"{recorded.root.name}#{i}",
-        descriptions=embedder.knows_words,
-    )
-    return pickle.dumps(embedded)
+    episode, name = episodes.read(i, keys, frames), f"{recorded.root.name}#{i}"
+    embedded = embedder.embed_episode(episode, episodes.fps / files.every, name)
+    return pickle.dumps(embedder.describe(embedded, episode.meta))

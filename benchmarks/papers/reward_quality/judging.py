@@ -11,13 +11,18 @@ from benchmarks.papers.reward_quality.measures import Judged
 from benchmarks.papers.reward_quality.recording import Recorded
 from benchmarks.papers.reward_quality.sentences import SENTENCES
 from touchgoal.rewards.curves import Curves
-from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal, goal_at_every_frame
+from touchgoal.rewards.features.embedded import (
+    IMAGE,
+    TEXT,
+    EmbeddedEpisode,
+    EmbeddedGoal,
+    last_rows,
+)
 from touchgoal.rewards.goals import Goal, OwnFrame, Sentence
-from touchgoal.rewards.value.fit_value import fit_value
-from touchgoal.rewards.value.value import Value
+from touchgoal.rewards.value import Value, fit_value
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
@@ -38,11 +43,16 @@ class Judge:
         """Return the curves of an episode to a goal."""
         return compute_curves(episode, goal, self.normalizer, self.value)
 
+    def plain_curves(self, episode: EmbeddedEpisode, goal: EmbeddedGoal) -> Curves:
+        """Return the plain distances of an episode to a goal, as the paper has them."""
+        return compute_curves(episode, goal, self.normalizer, plain=True)
+
     def costs(self, episode: EmbeddedEpisode, name: str) -> dict[str, Float[np.ndarray, " n"]]:
-        """Return the costs to the goal of an object; a sentence has curves of its own."""
-        costs = self.curves(episode, self.goals[name]).costs
+        """Return costs and plain distances to the goal of an object, and to its sentence."""
+        curves = self.curves(episode, self.goals[name])
+        costs = {**curves.costs, **curves.plain}
         if name in self.sentences:
-            words = self.curves(episode, self.sentences[name]).costs
+            words = self.plain_curves(episode, self.sentences[name]).costs
             costs |= {curve: words[curve] for curve in ("text", "image+text")}
         return costs
 
@@ -75,8 +85,8 @@ class Judge:
             if embedder.knows_words:
                 sentence = Sentence(SENTENCES[r.object])
                 goal = embedder.embed_goal(Goal(image=OwnFrame(), text=sentence), episode)
-                words = self.curves(episode, goal)
-            found.append((self.curves(episode, own), words))
+                words = self.plain_curves(episode, goal)
+            found.append((self.plain_curves(episode, own), words))
         return found
 
 
@@ -88,10 +98,8 @@ def fit_judge(files: EmbeddedFiles, recorded: Sequence[Recorded]) -> Judge:
     for r in recorded:
         if r.purpose == "goal":
             episode = files.load(r)
-            ends.setdefault(r.object, []).append(episode.take(slice(len(episode) - 1, None)))
-    goals = {
-        name: goal_at_every_frame(found[0].extended(found[1:])) for name, found in ends.items()
-    }
+            ends.setdefault(r.object, []).append(episode)
+    goals = {name: EmbeddedGoal(last_rows(found)) for name, found in ends.items()}
     for r in recorded:
         if r.object not in goals and r.purpose == "test":
             raise UserError(f"no goal for {r.object}: its expert always failed; see {r.root}")
@@ -107,7 +115,7 @@ def _sentences(encoder: str, goals: dict[str, EmbeddedGoal]) -> dict[str, Embedd
         return {}
     return {
         name: EmbeddedGoal(
-            {}, frozenset(), image=goal.image, text=embedder.embed_sentences([SENTENCES[name]])
+            {IMAGE: goal.features[IMAGE], TEXT: embedder.embed_sentences([SENTENCES[name]])}
         )
         for name, goal in goals.items()
     }

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from benchmarks.papers.reward_quality.measures import Estimate, Judged
-from touchgoal.rewards.report.text_table import aligned
+from touchgoal.rewards.report.tables import aligned
 from touchgoal.rewards.success import SuccessThreshold
 
 Grid = Mapping[str, Mapping[str, Estimate]]  # figures by row and curve

@@ -2,7 +2,7 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
 const COLORS = 10, MARGIN = { left: 46, right: 10, top: 12, bottom: 26 };
-const hidden = new Set(data.hidden);
+const hidden = new Set();
 let chosen = null, frame = 0, order = data.episodes.slice(), sortedBy = null, descending = false;
 
 function make(tag, attributes, parent, text) {
@@ -34,20 +34,20 @@ function choose(episode) {
     episode.contact === null ? "no contact found" : `first contact at frame ${episode.contact} (${episode.contact_source})`]
     .filter(Boolean).join(" · ");
   byId("slider").max = episode.frames - 1;
-  drawPictures();
+  drawImages();
   drawChart();
   show(episode.frames - 1);
   for (const row of byId("table").tBodies[0].rows) row.classList.toggle("chosen", row.dataset.name === episode.name);
   history.replaceState(null, "", "#" + encodeURIComponent(episode.name));
 }
 
-function drawPictures() {
-  byId("pictures").replaceChildren();
+function drawImages() {
+  byId("images").replaceChildren();
   for (const [name, sheet] of Object.entries(chosen.sheets)) {
-    const figure = make("figure", {}, byId("pictures"));
+    const figure = make("figure", {}, byId("images"));
     const height = 168, scale = height / sheet.height;
-    const picture = make("div", { "data-sheet": name }, figure);
-    picture.style.cssText = `width:${sheet.width * scale}px;background-image:url(${sheet.uri});` +
+    const image = make("div", { "data-sheet": name }, figure);
+    image.style.cssText = `width:${sheet.width * scale}px;background-image:url(${sheet.uri});` +
       `background-size:${sheet.columns * sheet.width * scale}px auto`;
     make("figcaption", {}, figure, name.replace("_", " "));
   }
@@ -142,7 +142,7 @@ function show(wanted) {
   byId("slider").value = frame;
   byId("time").textContent = `${(frame / chosen.fps).toFixed(2)} s, frame ${frame}`;
   const k = nearest(chosen.shown, frame), point = nearest(chosen.at, frame);
-  for (const div of byId("pictures").querySelectorAll("[data-sheet]")) {
+  for (const div of byId("images").querySelectorAll("[data-sheet]")) {
     const sheet = chosen.sheets[div.dataset.sheet];
     place(div, sheet, k, 168 / sheet.height);
   }

@@ -26,7 +26,7 @@ from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes.bootstrap import mean_interval
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.format import set_files
-from touchgoal.rewards.report.text_table import aligned
+from touchgoal.rewards.report.tables import aligned
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 

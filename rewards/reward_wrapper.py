@@ -9,13 +9,12 @@ from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE, Obse
 from touchgoal.rewards.curves import GAMMA
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.online.cost_meter import CostMeter
-from touchgoal.rewards.reward_model import RewardModel
-from touchgoal.runtime.errors import UserError
+from touchgoal.rewards.online import CostMeter
+from touchgoal.rewards.reward import Reward
 
 
 def inputs_of(env: gym.Env) -> Inputs:
-    """Return what is known about an environment's observations, for `load_reward_model`.
+    """Return what is known about an environment's observations, for `Reward.prepare`.
 
     Its `sensor`, with a name, and `task` count if it has them, as touchgoal's environments do.
     """
@@ -33,13 +32,8 @@ def inputs_of(env: gym.Env) -> Inputs:
     )
 
 
-class TouchReward(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
+class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
     """Replaces an environment's reward by one from the cost to a goal outside the episode.
-
-        env = touchgoal.make("pick-place")
-        goal = parse_goal("goal:runs/fit/goal.npz")
-        model = load_reward_model(inputs_of(env), [goal], normalizer="runs/fit/normalizer.json")
-        env = TouchReward(env, model)
 
     The potential form pays the fall of the cost, cost_before - gamma cost: with gamma 1 holding still
     pays nothing, and the return depends only on the first and the last cost. The state form pays
@@ -50,31 +44,23 @@ class TouchReward(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray])
     def __init__(
         self,
         env: gym.Env,
-        model: RewardModel,
+        reward: Reward,
         form: Literal["potential", "state"] = "potential",
         gamma: float = GAMMA,
     ) -> None:
         """Wrap an environment whose observations have touchgoal's keys.
 
-        UserError: another sensor or camera than the model's, or a goal inside the episode.
+        UserError: a goal inside the episode, or one that the observations cannot be compared with.
 
         Args:
             gamma: discount per second of the potential form. For an algorithm that discounts by g per
                 step it is g to the power of the steps per second.
         """
         super().__init__(env)
-        inputs, made_with = inputs_of(env), model.embedder.made_with
-        if inputs.sensor and made_with.sensor and inputs.sensor != made_with.sensor:
-            raise UserError(
-                f"the reward is for the sensor {made_with.sensor}, the environment has "
-                f"{inputs.sensor}: load a model for inputs_of(env)"
-            )
-        if model.goal.image is not None and model.embedder.camera not in inputs.cameras:
-            raise UserError(f"the environment has no camera {model.embedder.camera}: add it")
         rate = getattr(getattr(env.unwrapped, "config", None), "control_hz", CONTROL_HZ)
-        self._model, self._form, self._gamma = model, form, gamma ** (1 / rate)
-        self._rate = float(rate)
-        self._meter = CostMeter(model, rate=self._rate)
+        self._rate, self._form, self._gamma = float(rate), form, gamma ** (1 / rate)
+        self._reward = reward.prepare(inputs_of(env))
+        self._meter = CostMeter(self._reward, rate=self._rate)
         self._first: list[Observation] = []
         self._cost = 0.0
 
@@ -83,7 +69,7 @@ class TouchReward(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray])
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode, whose first observations must be free of contact."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._meter = CostMeter(self._model, str(info.get("object", "")), self._rate)
+        self._meter = CostMeter(self._reward, str(info.get("object", "")), self._rate)
         self._first = []
         self._cost = self._measure(observation)
         return observation, {**info, "cost": self._cost}

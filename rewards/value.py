@@ -6,23 +6,30 @@ goal, where distances to a goal say little. It looks at one frame at a time and 
 goal: it holds for the task, cameras and towers that it was fitted to, and is refused elsewhere.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float16
 from torch import Tensor, nn
 
+from touchgoal.control.features import IMAGE_PREFIX
 from touchgoal.encoders.training.weights import WeightsFormat
-from touchgoal.rewards.features.embedded import CameraFeatures
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, Features, cameras_of, map_name
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 VALUE_FORMAT = WeightsFormat("value", "value", "fit one with touchgoal fit-normalizer --value")
 REMEDY = "fit another with touchgoal fit-normalizer --value, or move value.json away"
+LEAST_EPISODES = 4
 _HEADS = 4
 _CHUNK = 256  # frames in float32 at once
+_STEPS, _BATCH = 1000, 128  # "off" of objects not fitted: AUC .90, after 400 steps .78
+_MOST_FRAMES = 8192  # of all episodes: 0.7 GB of maps
+_LEARNING_RATE, _WEIGHT_DECAY = 3e-3, 1.0  # the same with 5: .81, with 20: .71
 
 
 @dataclass(frozen=True)
@@ -74,10 +81,10 @@ class Value(nn.Module):
         return torch.stack([head(standardised) for head in self.heads])
 
     @torch.no_grad()
-    def progress(self, cameras: Mapping[str, CameraFeatures]) -> Float[np.ndarray, " n"]:
+    def progress(self, features: Features) -> Float[np.ndarray, " n"]:
         """Return the predicted progress at each frame, from that frame alone, in [0, 1]."""
-        maps = stacked_maps(cameras, self.config.cameras)
-        chunks = [self(torch.from_numpy(maps[i : i + _CHUNK])) for i in range(0, len(maps), _CHUNK)]
+        maps = torch.from_numpy(_stacked(features, self.config.cameras))
+        chunks = [self(some.float()) for some in maps.split(_CHUNK)]
         return torch.cat([c.mean(0) for c in chunks]).clamp(0, 1).numpy().astype(np.float64)
 
     def mismatch(self, task: str, cameras: tuple[str, ...], towers: str) -> str | None:
@@ -103,12 +110,59 @@ class Value(nn.Module):
         return value
 
 
-def stacked_maps(
-    cameras: Mapping[str, CameraFeatures], keys: tuple[str, ...]
-) -> Float32[np.ndarray, "n cameras c yx"]:
+def fit_value(episodes: Sequence[EmbeddedEpisode], task: str) -> Value:
+    """Fit on successes: the target of frame t of T is t / (T - 1).
+
+    UserError: fewer than 4 episodes, or one without the maps of all cameras.
+    """
+    keys = _check(episodes)
+    step = -(-sum(len(e) for e in episodes) // _MOST_FRAMES)
+    maps = torch.from_numpy(np.concatenate([_stacked(e.features, keys)[::step] for e in episodes]))
+    target = torch.cat([torch.linspace(0, 1, len(e))[::step] for e in episodes])
+    shape = episodes[0].features[map_name(keys[0])].shape[1:]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        value = Value(ValueConfig(task, keys, episodes[0].made_with.towers, shape, len(episodes)))
+        value.mean.copy_(maps.float().mean((0, 3))[..., None])
+        value.spread.copy_(maps.float().std((0, 3))[..., None] + 1e-6)
+        _regress(value, maps, target)
+    return value.eval().requires_grad_(False)
+
+
+def _regress(
+    value: Value, maps: Float16[Tensor, "n cameras c yx"], target: Float[Tensor, " n"]
+) -> None:
+    """Minimise the squared error of all heads, on the same batches."""
+    optimizer = torch.optim.AdamW(value.parameters(), _LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, _STEPS)
+    for _ in track(range(_STEPS), "fitting the value", "step"):
+        batch = torch.randint(len(maps), (_BATCH,))
+        loss = (value(maps[batch].float()) - target[batch]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+
+
+def _check(episodes: Sequence[EmbeddedEpisode]) -> tuple[str, ...]:
+    """Return the keys of the cameras that a value looks through."""
+    if len(episodes) < LEAST_EPISODES:
+        raise UserError(
+            f"a value needs at least {LEAST_EPISODES} successful episodes, these are {len(episodes)}"
+        )
+    names = cameras_of(episodes[0].features)
+    for e in episodes:
+        if not names or any(map_name(name) not in e.features for name in names):
+            raise UserError(
+                f"{e.source} has no feature maps of {' and '.join(names) or 'a camera'}: a value "
+                "needs the offline towers and the same cameras in every episode"
+            )
+    return tuple(IMAGE_PREFIX + name for name in names)
+
+
+def _stacked(features: Features, keys: Sequence[str]) -> Float16[np.ndarray, "n cameras c yx"]:
     """Return the maps of several cameras, positions flattened."""
-    maps = [features.map for key in keys if (features := cameras[key]).map is not None]
-    together = np.stack(maps, axis=1).astype(np.float32)
+    together = np.stack([features[map_name(key)] for key in keys], axis=1)
     return together.reshape(*together.shape[:3], -1)
 
 

@@ -1,6 +1,6 @@
-"""Distance of a trajectory to a goal in embedding space (MMWand, section V-E, with touch).
+"""Cost of an embedded trajectory to a goal: its parts, and MMWand's plain distances (section V-E).
 
-All distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over the fingertips.
+Plain distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over the fingertips.
 """
 
 from collections.abc import Mapping
@@ -13,35 +13,25 @@ from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.distance.parts import (
     VALUE,
     WORDS,
+    Costs,
     cosine_distances,
+    mean_products,
     part_costs,
     smooth_and_fuse,
     soft_minimum,
 )
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
-from touchgoal.rewards.value.value import Value
+from touchgoal.rewards.features.embedded import (
+    IMAGE,
+    TEXT,
+    TEXT_BASELINE,
+    TOUCH,
+    EmbeddedEpisode,
+    EmbeddedGoal,
+    Features,
+)
+from touchgoal.rewards.value import Value
 
 _ALPHA = 0.5  # share of the way to the line through baseline and sentence
-
-
-def compute_distances(
-    episode: EmbeddedEpisode, goal: EmbeddedGoal, completed: bool
-) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return the raw cosine distance per frame, for each modality that has a goal.
-
-    With `completed`, touch is completed to unit length first (see `complete`).
-    """
-    raw = {}
-    if goal.image is not None:
-        raw["image"] = soft_minimum(cosine_distances(episode.pictures(), goal.image))
-    if goal.touch is not None:
-        touch, goals = episode.touches(), goal.touch
-        if completed:
-            touch, goals = complete(touch), complete(goals)
-        raw["tactile"] = soft_minimum(touch_distances(touch, goals))
-    if goal.text is not None:
-        raw["text"] = soft_minimum(text_distances(episode.touches(), goal.text, goal.text_baseline))
-    return raw
 
 
 def compute_curves(
@@ -50,22 +40,25 @@ def compute_curves(
     normalizer: DistanceNormalizer | None,
     value: Value | None = None,
     before: Mapping[str, float] | None = None,
+    plain: bool = False,
 ) -> Curves:
     """Return the curves of one trajectory to one goal; raw distances alone without a normalizer.
 
-    `before` holds the costs of the parts at the previous frame, if the trajectory comes in pieces.
-    UserError: the normalizer lacks a modality or was fitted for something else.
+    `before` holds the costs of the parts at the previous frame, if the trajectory comes in pieces;
+    with `plain` the parts are left out. UserError: the normalizer lacks a modality or was fitted for
+    something else.
     """
     # normalizers were fitted on the distances of incomplete touches
-    raw = compute_distances(episode, goal, completed=normalizer is None)
+    raw = plain_distances(episode.features, goal.features, completed=normalizer is None)
     same = goal.same_episode
-    normalised, parts = {}, {}
+    normalised: Costs = {}
+    parts: Costs = {}
     if normalizer is not None:
         normalised = normalizer.normalise(raw, episode.made_with, same)
-    if normalizer is not None and normalizer.unit:
-        parts = part_costs(episode, goal, normalizer.unit)
+    if normalizer is not None and normalizer.unit and not plain:
+        parts = part_costs(episode.features, goal.features, normalizer.unit)
         if value is not None:
-            parts[VALUE] = 1 - value.progress(episode.cameras)
+            parts[VALUE] = 1 - value.progress(episode.features)
         if "text" in normalised:
             parts[WORDS] = np.clip(normalised["text"], 0, 1)
         parts = smooth_and_fuse(parts, episode.fps, before)
@@ -81,6 +74,22 @@ def compute_curves(
     )
 
 
+def plain_distances(mine: Features, goal: Features, completed: bool) -> Costs:
+    """Return the raw cosine distance per frame, for each modality that has a goal.
+
+    With `completed`, touch is completed to unit length first (see `complete`).
+    """
+    raw = {}
+    if IMAGE in goal:
+        raw["image"] = soft_minimum(cosine_distances(mine[IMAGE], goal[IMAGE]))
+    if TOUCH in goal:
+        touch, goals = (complete(f[TOUCH]) if completed else f[TOUCH] for f in (mine, goal))
+        raw["tactile"] = soft_minimum(touch_distances(touch, goals))
+    if TEXT in goal:
+        raw["text"] = soft_minimum(text_distances(mine[TOUCH], goal[TEXT], goal.get(TEXT_BASELINE)))
+    return raw
+
+
 def complete(touch: Float32[np.ndarray, "*n k"]) -> Float32[np.ndarray, "*n k+1"]:
     """Return embeddings completed to unit length by a coordinate of their own.
 
@@ -92,15 +101,14 @@ def complete(touch: Float32[np.ndarray, "*n k"]) -> Float32[np.ndarray, "*n k+1"
 
 
 def touch_distances(
-    touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "sides g k"]
+    touch: Float32[np.ndarray, "n sides k"], goals: Float32[np.ndarray, "g sides k"]
 ) -> Float[np.ndarray, "n g"]:
     """Return the distance of each touch to each goal's same fingertip, mean over the fingertips."""
-    cosine = np.einsum("snk,sgk->ng", touch, goals, dtype=np.float64)
-    return 1 - cosine / len(touch)
+    return 1 - mean_products(touch, goals)
 
 
 def text_distances(
-    touch: Float32[np.ndarray, "sides n k"],
+    touch: Float32[np.ndarray, "n sides k"],
     goals: Float32[np.ndarray, "g k"],
     baseline: Float32[np.ndarray, "b k"] | None = None,
 ) -> Float[np.ndarray, "n g"]:
@@ -111,12 +119,12 @@ def text_distances(
     distinguish the two sentences so counts less.
     """
     if baseline is None or not len(baseline):
-        return 1 - np.mean(touch, axis=0, dtype=np.float64) @ goals.astype(np.float64).T
+        return 1 - np.mean(touch, axis=1, dtype=np.float64) @ goals.astype(np.float64).T
     distances = []
     for goal in goals.astype(np.float64):
         line = goal - baseline[0]
         line /= max(float(np.linalg.norm(line)), 1e-9)
         along = ((touch - baseline[0]) @ line)[..., None] * line + baseline[0]
         moved = _ALPHA * along + (1 - _ALPHA) * touch
-        distances.append(((moved - goal) ** 2).sum(-1).mean(0) / 2)
+        distances.append(((moved - goal) ** 2).sum(-1).mean(1) / 2)
     return np.stack(distances, axis=1)

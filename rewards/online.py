@@ -1,4 +1,4 @@
-"""The cost of a trajectory while it happens, as `reward-curves` computes it from the recording."""
+"""The cost of a run while it happens, as `reward-curves` computes it from the recording."""
 
 import time
 from collections.abc import Sequence
@@ -18,15 +18,14 @@ from touchgoal.control.features import (
     Observation,
 )
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.curves import FUSED
+from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.normalizer import REAL_SCENE
-from touchgoal.rewards.distance.parts import FUSED
 from touchgoal.rewards.features.embedded import EmbeddedGoal
-from touchgoal.rewards.features.feature_stream import FeatureStream
+from touchgoal.rewards.features.embedder import FeatureStream
 from touchgoal.rewards.goals import Inputs, parse_goal
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.online.failure_watch import FailureWatch
-from touchgoal.rewards.reward_model import RewardModel, load_reward_model
+from touchgoal.rewards.reward import PreparedReward, Reward
 from touchgoal.runtime.errors import UserError
 
 _FIRST_COST_TIMEOUT = 30.0  # s for the first cost, which warms up the networks
@@ -40,7 +39,9 @@ class CostMeter:
     ticks so far, while a recording's is always that of its first five.
     """
 
-    def __init__(self, model: RewardModel, object_name: str = "", rate: float = CONTROL_HZ) -> None:
+    def __init__(
+        self, reward: PreparedReward, object_name: str = "", rate: float = CONTROL_HZ
+    ) -> None:
         """Prepare for one run.
 
         UserError if its goal is known only at its end, or if several modalities have no normalizer.
@@ -49,15 +50,14 @@ class CostMeter:
             object_name: object of the run, which chooses among the goals; "" if unknown.
             rate: ticks per second.
         """
-        if model.goal.same_episode:
-            raise UserError("task.rewards: last and frame:K are not known before the end")
-        if model.normalizer is None and len(model.goal.as_dict()) > 1:
+        if reward.goal.same_episode:
+            raise UserError("goals last and frame:K are not known before the end of a run")
+        if reward.normalizer is None and len(reward.goal.as_dict()) > 1:
             raise UserError(
-                "task.rewards: raw distances of several modalities cannot be averaged: give one "
+                "raw distances of several modalities cannot be averaged: give one "
                 "goal of one modality (image:PATH or text:SENTENCE), or a normalizer"
             )
-        self._model, self._embedder = model, model.embedder
-        self._object, self._rate = object_name, rate
+        self._reward, self._object, self._rate = reward, object_name, rate
         self._goal: EmbeddedGoal | None = None
         self._stream: FeatureStream | None = None
         self._background_ticks = 0  # that the stream's background is the median of
@@ -73,13 +73,16 @@ class CostMeter:
         if self._stream is None or len(first) > self._background_ticks:
             before = [tick for tick in first if tick is not observation]
             ticks = [*before, observation]
-            self._stream = self._embedder.stream(_stacked(first), self._rate, "this run")
+            embedder = self._reward.embedder
+            self._stream = embedder.stream(_stacked(first), self._rate, "this run")
             self._background_ticks, self._parts = len(first), {}
         trajectory = replace(self._stream.embed(_stacked(ticks)), object=self._object)
+        reward = self._reward
         if self._goal is None:
-            self._goal = self._embedder.embed_goal(self._model.goal, trajectory)
-        model = self._model
-        curves = compute_curves(trajectory, self._goal, model.normalizer, model.value, self._parts)
+            self._goal = reward.embedder.embed_goal(reward.goal, trajectory)
+        curves = compute_curves(
+            trajectory, self._goal, reward.normalizer, reward.value, self._parts, reward.plain
+        )
         self._parts = {name: float(cost[-1]) for name, cost in curves.parts.items()}
         if FUSED in curves.parts:
             return self._parts[FUSED]
@@ -131,6 +134,25 @@ class OnlineCost:
         return self._meter.measure(*newest)
 
 
+class FailureWatch:
+    """Watches the cost of a run tick by tick.
+
+    The run has failed once the cost has stayed `rise` above its lowest value so far for `ticks`
+    ticks in a row: an object lost, or carried away from its goal. A run that gets nowhere keeps its
+    cost and is left to its time limit.
+    """
+
+    def __init__(self, rise: float, ticks: int) -> None:
+        self._rise, self._ticks = rise, ticks
+        self._lowest, self._above = float("inf"), 0
+
+    def update(self, cost: float) -> bool:
+        """Take the cost of the next tick; return whether the run has failed."""
+        self._lowest = min(self._lowest, cost)
+        self._above = self._above + 1 if cost > self._lowest + self._rise else 0
+        return self._above >= self._ticks
+
+
 def load_cell_cost(cell: CellConfig) -> OnlineCost:
     """Return the distance to the cell's goals, measured in a thread; `close` ends it.
 
@@ -147,10 +169,11 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
         cameras=cameras,
         task=cell.task.instruction or cell.task.name,
     )
-    goals = [parse_goal(text) for text in cell.task.rewards]
     task = cell.task
-    model = load_reward_model(
-        inputs, goals, task.encoder or None, normalizer=task.normalizer or None
+    reward = Reward(
+        [parse_goal(text) for text in task.rewards],
+        encoder=task.encoder or None,
+        normalizer=task.normalizer or None,
     )
-    meter = CostMeter(model, task.objects[0] if len(task.objects) == 1 else "")
+    meter = CostMeter(reward.prepare(inputs), task.objects[0] if len(task.objects) == 1 else "")
     return OnlineCost(meter, task.give_up)

@@ -1,0 +1,378 @@
+"""The reward: how far each frame of a trajectory is from a goal, in images, touch and words."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+import torch
+
+from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.preprocess import check_images
+from touchgoal.encoders.pretrained import AnyTouchEncoder
+from touchgoal.encoders.towers.towers import OfflineTowers, Towers, load_towers
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.distance.cost import compute_curves
+from touchgoal.rewards.distance.normalizer import (
+    NORMALIZER,
+    REMEDY,
+    DistanceNormalizer,
+    scene_of,
+)
+from touchgoal.rewards.features.embedded import EmbeddedEpisode
+from touchgoal.rewards.features.embedder import EpisodeEmbedder
+from touchgoal.rewards.features.embedding_cache import embed_trajectory
+from touchgoal.rewards.goals import (
+    SIDES,
+    Goal,
+    GoalLike,
+    GoalSpec,
+    Inputs,
+    OwnFrame,
+    TouchArrays,
+    assign_goals,
+    check_goal,
+    check_words,
+    goals_of_script,
+)
+from touchgoal.rewards.sources.episode_trajectories import default_goals
+from touchgoal.rewards.sources.open_source import open_source
+from touchgoal.rewards.sources.trajectory import Source
+from touchgoal.rewards.value import REMEDY as VALUE_REMEDY
+from touchgoal.rewards.value import VALUE_FORMAT, Value
+from touchgoal.runtime.errors import UserError
+
+_ARRAYS = "unknown"  # scene of arrays, which do not say where they were recorded
+_FIT = "touchgoal fit-normalizer, on successful episodes of your own"
+
+
+@dataclass(frozen=True)
+class PreparedReward:
+    """A reward for recordings of one kind: encoders, goals and normalizer."""
+
+    embedder: EpisodeEmbedder
+    goal: Goal  # the goal of each modality
+    normalizer: DistanceNormalizer | None  # normalizer of the distances; None for raw ones
+    value: Value | None  # value of the task, if one lies beside the normalizer
+    note: str  # which normalizer, or why there is none, for people
+    plain: bool = False  # plain distances in place of the parts
+
+    def curves(
+        self, trajectory: EmbeddedEpisode, before: Mapping[str, float] | None = None
+    ) -> Curves:
+        """Return the curves of a trajectory that `embedder` embedded; `before`: `compute_curves`."""
+        goal = self.embedder.embed_goal(self.goal, trajectory)
+        curves = compute_curves(
+            trajectory, goal, self.normalizer, self.value, before, plain=self.plain
+        )
+        return replace(curves, note=self.note)
+
+    def provenance(self) -> dict[str, str]:
+        """Return what the curves are made with, ready for JSON."""
+        return asdict(self.embedder.made_with) | {"normalizer": self.note}
+
+
+class Reward:
+    """Cost of trajectories to a goal, and the rewards that follow from it.
+
+        reward = touchgoal.Reward(goal="bank:data/episodes")
+        curves = reward(images=images, tactile={"left": left, "right": right})
+        curves.costs["tactile"]  # (T,): distance to the goal
+        curves.rewards["tactile"]  # (T,): -cost
+        curves.potential_rewards()["tactile"]  # (T,): Phi' - Phi with Phi = -cost
+        env = touchgoal.make("pick-place", reward=reward)
+
+    Encoders are loaded at the first use, once.
+    """
+
+    def __init__(
+        self,
+        goal: GoalLike | Sequence[GoalLike] = (),
+        *,
+        encoder: str | Path | AnyTouchEncoder | None = None,
+        towers: str | Towers | None = None,
+        normalizer: str | Path | DistanceNormalizer | None = None,
+        plain: bool = False,
+        device: str = "cpu",
+    ) -> None:
+        """Read the goals and the normalizer.
+
+        Args:
+            goal: one, or several of which each modality takes the first that applies to it:
+                any form of `reward-curves --goal`, such as "episode:data/set#3" or "last";
+                a frame number of the trajectory (image and touch);
+                an array (height, width, 3), a camera image;
+                arrays by name, {"image": ..., "left": ..., "right": ...}, each (height, width, 3),
+                of the goal state (touch with the same fingertips and the same background);
+                a sentence on how the object feels (touch; or images, with the towers of a CLIP and
+                without touch). Default: the trajectory's own last frame; where failures are among
+                the episodes of a set, the nearest end of its other successes with the same object.
+            encoder: touch encoder: a name ("gelsight_mini"), a folder, or one already loaded; a
+                sentence as goal needs one that is aligned with texts. Default: the one that ships
+                for the sensor.
+            towers: "offline", a CLIP's Hugging Face id or folder, or loaded ones. Default: those that
+                the encoder was trained with, "offline" without touch.
+            normalizer: what makes a cost of the distances: a file that `touchgoal fit-normalizer`
+                wrote, one already read, "encoder" for the one that ships with the encoder, or "none"
+                for raw cosine distances. A value beside the file is used. Default: the encoder's one
+                for the scene that it was fitted on, simulated pick-and-place; else raw distances.
+            plain: plain distances of image, touch and text in place of the parts of the cost.
+            device: torch device of the encoders.
+
+        Raises:
+            UserError: a goal that is none, a normalizer that cannot be read.
+        """
+        self.goals = goals_of_script(goal)
+        self._encoder, self._towers, self._plain, self._device = encoder, towers, plain, device
+        self._choice: str | None = None  # "encoder", "none", or None to choose by the scene
+        self._given: DistanceNormalizer | None = None
+        self._folder: Path | None = None  # of the given normalizer
+        self._name = "the given normalizer"
+        if isinstance(normalizer, DistanceNormalizer):
+            self._given = normalizer
+        elif normalizer is None or str(normalizer) in ("encoder", "none"):
+            self._choice = None if normalizer is None else str(normalizer)
+        else:
+            self._given, self._name = DistanceNormalizer.load(Path(normalizer)), str(normalizer)
+            self._folder = Path(normalizer).parent
+        self._encoders: dict[str | None, tuple[AnyTouchEncoder, Path | None]] = {}  # by sensor
+        self._loaded_towers: dict[str, Towers] = {}  # by name
+        self._embedders: dict[tuple[str | None, ...], EpisodeEmbedder] = {}
+
+    @overload
+    def __call__(
+        self, recording: Episode | None = None, *, images: np.ndarray | None = None,
+        tactile: Mapping[str, np.ndarray] | None = None, camera: str = FRONT,
+        fps: float = CONTROL_HZ,
+    ) -> Curves: ...  # fmt: skip
+    @overload
+    def __call__(
+        self, recording: EpisodeSet | str | Path, *, camera: str = FRONT
+    ) -> list[Curves]: ...
+    def __call__(
+        self,
+        recording: Episode | EpisodeSet | str | Path | None = None,
+        *,
+        images: np.ndarray | None = None,
+        tactile: Mapping[str, np.ndarray] | None = None,
+        camera: str = FRONT,
+        fps: float = CONTROL_HZ,
+    ) -> Curves | list[Curves]:
+        """Return the curves of one trajectory, of an episode, or of each episode of a set.
+
+        Args:
+            recording: an episode; or a set of episodes, opened or its folder; or videos (see
+                `reward-curves`). Embeddings of a set are kept inside it.
+            images: in place of a recording, camera images, uint8 (T, height, width, 3), RGB.
+            tactile: images of the fingertip sensors, "left", "right" or both, each as `images`. The
+                first 5 must be free of contact: they are the background.
+            camera: key of the measured camera.
+            fps: frames per second of an episode or of arrays.
+
+        Raises:
+            UserError: arrays that are not such images or do not match, a recording that cannot be
+                read, a goal that no modality takes.
+        """
+        if isinstance(recording, EpisodeSet | str | Path):
+            opened = isinstance(recording, EpisodeSet)
+            root, keys = (recording.root, recording.keys) if opened else (Path(recording), None)
+            source = open_source(root, camera, keys=keys)
+            if source.skipped:
+                raise UserError(source.skipped[0].reason)
+            prepared = self.prepare_source(source)
+            return [
+                prepared[t.name].curves(embed_trajectory(prepared[t.name].embedder, t))
+                for t in source.trajectories
+            ]
+        if recording is None:
+            recording, scene = _as_episode(images, tactile, camera), _ARRAYS
+        else:
+            scene = scene_of(recording.frames)
+        return self._measure_episode(recording, camera, fps, scene)
+
+    def prepare(self, inputs: Inputs, goals: Sequence[GoalSpec] = ()) -> PreparedReward:
+        """Check the goals against what will be measured, load the encoders, choose the normalizer.
+
+        `goals` stand in for the reward's own. UserError: whatever would stop the measurement.
+        """
+        specs = goals or self.goals or [OwnFrame()]
+        towers = self._towers
+        together = towers not in (None, OfflineTowers.name)
+        if towers is not None and not isinstance(towers, str):
+            together = towers.pretrained_together
+        goal = assign_goals(specs, inputs.modalities, together)
+        check_goal(goal, inputs)
+        embedder = self.embedder(inputs)
+        check_words(specs, embedder.encoder is None or embedder.knows_words)
+        normalizer, value, note = self._choose_normalizer(inputs, goal, embedder)
+        parts = normalizer is not None and bool(normalizer.unit) and not self._plain
+        if not parts:
+            embedder = self.embedder(inputs, parts=False)
+        return PreparedReward(embedder, goal, normalizer, value, note, self._plain)
+
+    def prepare_source(self, source: Source) -> dict[str, PreparedReward]:
+        """Prepare for each trajectory of a source, by name; see `prepare`."""
+        if self.goals:
+            return dict.fromkeys((t.name for t in source.trajectories), self.prepare(source.inputs))
+        goals = default_goals(source.trajectories)
+        prepared = {g: self.prepare(source.inputs, [g]) for g in dict.fromkeys(goals.values())}
+        return {name: prepared[goal] for name, goal in goals.items()}
+
+    def embedder(self, inputs: Inputs, parts: bool = True) -> EpisodeEmbedder:
+        """Load the encoders, or return those of earlier recordings like these.
+
+        UserError: no encoder ships for the sensor, it is for another one, or it was aligned with other
+        towers.
+        """
+        key = inputs.camera, inputs.sensor, *inputs.sides[:1], str(parts)
+        if key not in self._embedders:
+            _check_device(self._device)
+            touch, towers = self._touch_encoder(inputs)[0], self._towers
+            if isinstance(towers, str) or towers is None:
+                towers = self._load_towers(towers or (touch and touch.towers) or OfflineTowers.name)
+            self._embedders[key] = EpisodeEmbedder(towers, touch, inputs.camera or "", parts)
+        return self._embedders[key]
+
+    def _load_towers(self, name: str) -> Towers:
+        if name not in self._loaded_towers:
+            self._loaded_towers[name] = load_towers(name, self._device)
+        return self._loaded_towers[name]
+
+    def _touch_encoder(self, inputs: Inputs) -> tuple[AnyTouchEncoder | None, Path | None]:
+        """Return the touch encoder, and the folder that may hold a normalizer."""
+        if not inputs.sides:
+            if self._encoder is not None:
+                raise UserError(f"{inputs.name} has no touch: leave the encoder out")
+            return None, pretrained.DEFAULT_ENCODER  # whose normalizer knows images, too
+        if inputs.sensor not in self._encoders:
+            encoder, folder = self._encoder, None
+            if not isinstance(encoder, AnyTouchEncoder):
+                path = pretrained.find_encoder(encoder) if encoder else _shipped_for(inputs)
+                encoder = pretrained.load_encoder(path, inputs.sensor)
+                folder = path if path.is_dir() else None
+            encoder.to(self._device)
+            self._encoders[inputs.sensor] = encoder, folder
+        return self._encoders[inputs.sensor]
+
+    def _choose_normalizer(
+        self, inputs: Inputs, goal: Goal, embedder: EpisodeEmbedder
+    ) -> tuple[DistanceNormalizer | None, Value | None, str]:
+        """Return the normalizer, the value beside it, and which ones these are, for people."""
+        if self._choice == "none":
+            return None, None, "normalizer: none, raw cosine distances"
+        if (given := self._given) is not None:
+            if reason := _mismatch(given, goal, embedder):
+                raise UserError(f"{self._name} does not apply here: {reason}; {REMEDY}")
+            value, reason = _value_in(self._folder, inputs, embedder)
+            if reason:
+                raise UserError(f"{reason}; {VALUE_REMEDY}")
+            beside = "" if value is None else ", with the value beside it"
+            return given, value, f"normalizer: {self._name}{beside}"
+        folder = self._touch_encoder(inputs)[1]
+        scene = inputs.scene if self._choice is None else None
+        found, reason = _normalizer_in(folder, scene, goal, embedder)
+        if found is None and self._choice == "encoder":
+            raise UserError(f"the encoder's normalizer does not apply: {reason}; {REMEDY}")
+        if found is None:
+            return None, None, f"raw cosine distances, for {reason}; to normalise them: {_FIT}"
+        value, why_not = _value_in(folder, inputs, embedder)
+        beside = "" if value is None else ", with the value beside it"
+        without = f"; without the value, for {why_not}" if why_not else ""
+        return found, value, f"normalizer: {reason}{beside}{without}"
+
+    def _measure_episode(self, episode: Episode, camera: str, fps: float, scene: str) -> Curves:
+        sensor = episode.meta.get("sensor")
+        if sensor is None and scene == _ARRAYS and self._encoder is None:
+            sensor = pretrained.DEFAULT_ENCODER.name
+        inputs = Inputs(
+            name="this trajectory",
+            camera=camera if camera in episode.frames else None,
+            sides=tuple(key for key in TACTILE if key in episode.frames),
+            sensor=None if sensor is None else str(sensor),
+            scene=scene,
+            length=len(episode),
+            cameras=tuple(key for key in CAMERAS if key in episode.frames),
+            task=episode.task,
+        )
+        goals = [
+            goal.beside(episode.frames) if isinstance(goal, TouchArrays) else goal
+            for goal in self.goals
+        ]
+        prepared = self.prepare(inputs, goals)
+        return prepared.curves(prepared.embedder.embed_episode(episode, fps, inputs.name))
+
+
+def _as_episode(
+    images: np.ndarray | None, tactile: Mapping[str, np.ndarray] | None, camera: str
+) -> Episode:
+    names = {"images": camera, **SIDES}
+    given = ({} if images is None else {"images": images}) | dict(tactile or {})
+    if not given:
+        raise UserError("nothing to measure: give images, tactile or both")
+    for name, frames in given.items():
+        if name not in names:
+            raise UserError(f"tactile has no '{name}': give left, right or both")
+        check_images(name, frames, ndim=(4,))
+    if len({len(frames) for frames in given.values()}) > 1:
+        counts = ", ".join(f"{name} {len(frames)}" for name, frames in given.items())
+        raise UserError(f"images and tactile must have equally many frames, not {counts}")
+    if min(len(frames) for frames in given.values()) < 2:
+        raise UserError("a curve needs at least 2 frames")
+    return Episode({names[name]: frames for name, frames in given.items()}, "")
+
+
+def _check_device(device: str) -> None:
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"--device {device} cannot be used here ({reason}): give cpu") from error
+
+
+def _shipped_for(inputs: Inputs) -> Path:
+    images_alone = "or measure the images alone: --towers offline"
+    if inputs.sensor is None:
+        raise UserError(f"{inputs.name} does not name its sensor: give --encoder, {images_alone}")
+    try:
+        return pretrained.shipped_encoder_for(inputs.sensor)
+    except UserError as error:
+        raise UserError(f"{error}; {images_alone}") from None
+
+
+def _mismatch(normalizer: DistanceNormalizer, goal: Goal, embedder: EpisodeEmbedder) -> str | None:
+    return normalizer.mismatch(embedder.made_with, goal.as_dict(), goal.same_episode)
+
+
+def _normalizer_in(
+    folder: Path | None, scene: str | None, goal: Goal, embedder: EpisodeEmbedder
+) -> tuple[DistanceNormalizer | None, str]:
+    """Return the normalizer in an encoder's folder and its path, or None and why it is not used.
+
+    It must have been fitted on the scene, if one is given.
+    """
+    if folder is None:
+        return None, "published weights and loaded encoders come without a normalizer"
+    path = folder / NORMALIZER
+    if not path.is_file():
+        return None, f"there is no {path}"
+    found = DistanceNormalizer.load(path)
+    reason = _mismatch(found, goal, embedder)
+    if scene is not None and found.scene != scene:
+        reason = f"it was fitted on {found.scene} episodes and the scene here is {scene}"
+    return (None, f"{path} does not apply: {reason}") if reason else (found, str(path))
+
+
+def _value_in(
+    folder: Path | None, inputs: Inputs, embedder: EpisodeEmbedder
+) -> tuple[Value | None, str]:
+    """Return the value beside a normalizer, and why it does not hold here; None without one."""
+    if folder is None or not VALUE_FORMAT.weights_path(folder).is_file():
+        return None, ""
+    value = Value.load(folder)
+    if reason := value.mismatch(inputs.fitted_task, inputs.cameras, embedder.made_with.towers):
+        return None, f"the value in {folder} does not apply here: {reason}"
+    return value, ""
