@@ -14,12 +14,12 @@ from benchmarks.real_touch.embedders import find_embedder
 from benchmarks.real_touch.property_probe import (
     adapted_nearest_is_same,
     nearest_is_same,
+    predict_properties,
     sentences_right,
 )
 from benchmarks.real_touch.videos import Config, run
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import load_encoder
-from touchgoal.encoders.probes import property_probe
 from touchgoal.encoders.towers.towers import OfflineTowers
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video
@@ -135,9 +135,9 @@ def test_properties_of_unseen_objects_are_predicted() -> None:
     objects = np.repeat(np.arange(30), 4)
     ranks = np.stack([objects % 3, (objects // 3) % 3], 1)
     embeddings = np.eye(3)[ranks].reshape(120, 6) + 0.2 * rng.normal(size=(120, 6))
-    predicted = property_probe.predict_properties(embeddings, ranks, objects)
+    predicted = predict_properties(embeddings, ranks, objects)
     assert (predicted.ranks == ranks).mean() > 0.95
-    shuffled = property_probe.predict_properties(rng.normal(size=(120, 6)), ranks, objects)
+    shuffled = predict_properties(rng.normal(size=(120, 6)), ranks, objects)
     assert (shuffled.ranks == ranks).mean() < 0.45  # chance, for no strength is chosen on them
 
 

@@ -149,7 +149,7 @@ def _ceilings(cell: CellConfig, safety: ActionFilter) -> str:
     demonstrations = "the default of a task of your own" if len(own) < len(ceilings) else ""
     if task is not None:
         demonstrations = (
-            f"{task.episodes} demonstrations of {cell.task.name} reach {task.force:g} N and "
+            f"demonstrations of {cell.task.name} reach {task.force:g} N and "
             f"{1e3 * task.indentation:.2g} mm"
         )
     return (
