@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.published_touch.force_grasps import read_force_grasps
-from benchmarks.real_touch import forces, markers
+from benchmarks.real_touch import forces, markers, property_probe
 from benchmarks.real_touch.embedders import find_embedder
 from benchmarks.real_touch.property_probe import (
     adapted_nearest_is_same,
@@ -19,7 +19,6 @@ from benchmarks.real_touch.property_probe import (
 from benchmarks.real_touch.videos import Config, run
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import load_encoder
-from touchgoal.encoders.probes import property_probe
 from touchgoal.encoders.towers.towers import OfflineTowers
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from benchmarks.options import BenchmarkOptions
+from benchmarks.real_touch import property_probe as probe
 from benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.control.tactile.contact import contact_strength, threshold_for
-from touchgoal.encoders.probes import property_probe as probe
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.whitening.text_head import EmbedTexts
 from touchgoal.episodes.importers.labelled_videos import (
