@@ -211,14 +211,11 @@ class PickPlaceConfig(EnvConfig):
     """Range of the object's mass, kg."""
     grasp_force: ForceRange = (5.0, 30.0)
     """Range of the force of each finger, N."""
+    # Largest distance of the placed object's centre from the goal, m.
     tolerance: Annotated[float, Field(gt=0, le=0.1, allow_inf_nan=False), FIXED] = 0.02
-    """Largest distance of the placed object's centre from the goal, m."""
-    size_factor: Annotated[Positive, FIXED] = 1.0
-    """Factor of the objects' sizes."""
-    friction_factor: Annotated[Positive, FIXED] = 1.0
-    """Factor of the objects' friction."""
-    nudge: Annotated[NotNegative, FIXED] = 0.0
-    """Distance by which the object is moved a second after the start, in a random direction, m."""
+    size_factor: Annotated[Positive, FIXED] = 1.0  # of the objects
+    friction_factor: Annotated[Positive, FIXED] = 1.0  # of the objects
+    nudge: Annotated[NotNegative, FIXED] = 0.0  # m by which the object moves after a second
     release: bool = False
     """Success also requires that the hand lets go. The paper's reward curves end in touch, so by
     default an episode ends with the placed object still in the hand."""
@@ -266,8 +263,7 @@ class BeadMazeConfig(EnvConfig):
     """Wires to draw from, such as helix-1; default: the first `n-wires` of `split`."""
     split: Split = "training"
     """Set of wires to draw from; the sets are disjoint."""
-    families: Annotated[tuple[Family, ...], FIXED] = TRAINED
-    """Families of wires to draw from."""
+    families: Annotated[tuple[Family, ...], FIXED] = TRAINED  # of wires to draw from
     n_wires: Count | None = None
     """Number of wires to draw from; default: 200, or all if the split has fewer."""
     bead: Literal["sphere", "cylinder"] = "sphere"
@@ -276,10 +272,11 @@ class BeadMazeConfig(EnvConfig):
     """Range of the force of each finger, N."""
     start_angle: Annotated[NotNegative, Field(le=45)] = 0.0
     """Largest angle between hand and wire at the start, degrees."""
-    wire_friction: Annotated[tuple[Friction, Friction], ORDERED, FIXED] = (0.15, 0.25)
-    """Range of the friction coefficient between bead and wire."""
-    stall_seconds: Annotated[Positive, FIXED] = 5.0
-    """Time without 2 mm of progress after which the bead counts as jammed, s."""
+    wire_friction: Annotated[tuple[Friction, Friction], ORDERED, FIXED] = (
+        0.15,
+        0.25,
+    )  # bead on wire
+    stall_seconds: Annotated[Positive, FIXED] = 5.0  # s without 2 mm of progress: jammed
 
     def chosen_wires(self, count: int | None = None) -> list[Wire]:
         """Return the wires to draw from, or `count` of them; named wires repeat in turn."""

@@ -88,7 +88,7 @@ def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    config = demo.Config(out=tmp_path)
+    config = demo.Config(out=tmp_path, words="a hard smooth round object")
     demo.main(replace(config, env=replace(config.env, max_seconds=2.6)))
     for name in ("episode.mp4", "curves.png", "curves.csv", "metrics.json", "config.json"):
         assert (tmp_path / name).stat().st_size > 0
