@@ -28,22 +28,13 @@ from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
-REPLACEMENTS = {
-    "neutral": "untouched all the time, as in its first frame",
-    "shuffled": "its frames in random order",
-    "shifted": "a second late",
-    "mirrored": "left and right exchanged",
-    "another's": "of another episode, with another object where there is one",
-}
-"""Meaning of each replacement of an episode's touch."""
+REPLACEMENTS = ("neutral", "shuffled", "shifted", "mirrored", "another's")
+"""Touch of an episode in place of its own: as in its first frame all the time, its frames in random
+order, a second late, left and right exchanged, or of an episode with another object."""
 
-METRICS = {
-    "order": "rank correlation of falling cost with time, mean over successes",
-    "last cost": "cost of the last frame, mean over successes",
-    "lag": "frames from first contact to half of the fall, mean over successes",
-    "AUC": "share of (failure, success) pairs in which the failure has the higher last cost",
-}
-"""Meaning of each metric."""
+METRICS = ("order", "last cost", "lag", "AUC")
+"""Means over successes: rank correlation of the falling cost with time, cost of the last frame, frames
+from first contact to half of the fall. Share of pairs in which the failure has the higher last cost."""
 
 _SHIFT = 1.0  # s
 _DRAWS = 2000
