@@ -31,9 +31,6 @@ class Config:
     success_from: CountOrNone = 0
     """Number of successes, the last ones, that fit nothing else and set the threshold of success
     (success.json): at least 9, for at most 10 % of successes rejected. 0: no threshold."""
-    made_failures: CountOrNone = 0
-    """Make seven kinds of failure from the images of so many of the successes of --success-from, to
-    see how many failures pass the threshold."""
     camera: str = "front"
     """Camera of the plain distance of images, such as front, wrist or a LeRobot set's top."""
     keys: Annotated[tuple[str, ...], RARE] = ()
@@ -54,7 +51,6 @@ class Config:
 def main(config: Config) -> None:
     """Check, embed, fit, and write normalizer.json."""
     from touchgoal.episodes.keys import parse_keys
-    from touchgoal.episodes.schema import Episode, joined
     from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
     from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.features.embedding_cache import embed_trajectory
@@ -63,7 +59,6 @@ def main(config: Config) -> None:
     from touchgoal.rewards.sources.open_source import open_successes
     from touchgoal.rewards.success import (
         SUCCESS,
-        accepted_failures,
         check_demonstrations,
         fit_success,
         last_costs,
@@ -117,14 +112,5 @@ def main(config: Config) -> None:
         threshold = fit_success(last_costs(calibration, ends, normalizer, value))
         threshold.save(out / SUCCESS)
         print(threshold)
-        chosen = trajectories[len(trajectories) - config.success_from :][: config.made_failures]
-        successes = [joined(t.chunks()) for t in track(chosen, "reading", "trajectory")]
-
-        def last_cost(failure: Episode) -> float:
-            made = embedder.embed_episode(failure, chosen[0].fps, str(failure.meta["outcome"]))
-            return last_costs([made], ends, normalizer, value)[0]
-
-        for kind, (passed, made) in accepted_failures(threshold, successes, last_cost).items():
-            print(f"  made failure {kind:<18}{passed} of {made} accepted")
     goal = f"--goal goal:{out / GOAL_FILE} --normalizer {out / NORMALIZER}"
     print(f"next: touchgoal reward-curves {config.sources[0]} {goal}")

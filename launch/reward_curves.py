@@ -100,7 +100,7 @@ def main(config: Config) -> None:
     if source.summary:
         print(source.summary)
     rewards = reward.prepare_source(source)
-    specs = [spec for one in rewards.values() for spec in one.goal.specs]
+    specs = [spec for one in rewards.values() for spec in one.goals.values()]
     if not config.goal and any(isinstance(spec, Bank) for spec in specs):
         print("failures are among the episodes: the goal is the nearest end of other successes")
     elif OwnFrame() in specs and any(t.meta.get("success") is False for t in source.trajectories):

@@ -10,17 +10,12 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from touchgoal.encoders.probes.bootstrap import mean_interval, percentile_interval
 from touchgoal.rewards.curves import FUSED, Curves
 from touchgoal.rewards.distance.cost import compute_curves
-from touchgoal.rewards.features.embedded import (
-    FINGERTIPS,
-    TOUCH,
-    EmbeddedEpisode,
-    EmbeddedGoal,
-)
+from touchgoal.rewards.features.embedded import FINGERTIPS, TOUCH, EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.features.embedding_cache import embed_trajectory
 from touchgoal.rewards.metrics import auc, measure_curve
 from touchgoal.rewards.reward import PreparedReward
@@ -28,22 +23,13 @@ from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
-REPLACEMENTS = {
-    "neutral": "untouched all the time, as in its first frame",
-    "shuffled": "its frames in random order",
-    "shifted": "a second late",
-    "mirrored": "left and right exchanged",
-    "another's": "of another episode, with another object where there is one",
-}
-"""Meaning of each replacement of an episode's touch."""
+REPLACEMENTS = ("neutral", "shuffled", "shifted", "mirrored", "another's")
+"""Touch of an episode in place of its own: as in its first frame all the time, its frames in random
+order, a second late, left and right exchanged, or of an episode with another object."""
 
-METRICS = {
-    "order": "rank correlation of falling cost with time, mean over successes",
-    "last cost": "cost of the last frame, mean over successes",
-    "lag": "frames from first contact to half of the fall, mean over successes",
-    "AUC": "share of (failure, success) pairs in which the failure has the higher last cost",
-}
-"""Meaning of each metric."""
+METRICS = ("order", "last cost", "lag", "AUC")
+"""Means over successes: rank correlation of the falling cost with time, cost of the last frame, frames
+from first contact to half of the fall. Share of pairs in which the failure has the higher last cost."""
 
 _SHIFT = 1.0  # s
 _DRAWS = 2000
@@ -61,6 +47,11 @@ class AuditRow:
     replaced: float
     low: float  # 95 % interval of replaced - real
     high: float
+
+    @property
+    def change(self) -> str:
+        """The difference with its interval."""
+        return f"{self.replaced - self.real:+.2f} [{self.low:.2f}, {self.high:.2f}]"
 
 
 @dataclass(frozen=True)
@@ -82,15 +73,18 @@ class AuditTable:
         row = self._row("order", "shuffled")
         if row is None or row.low != row.low:
             return "touch use cannot be judged: the order of the cost is undefined"
-        change = f"{row.replaced - row.real:+.2f} [{row.low:.2f}, {row.high:.2f}]"
         if not self.mattered:
-            return f"no sign that touch mattered: shuffled in time, the order changes by {change}"
+            return (
+                f"no sign that touch mattered: shuffled in time, the order changes by {row.change}"
+            )
         other = self._row("last cost", "another's")
         swapped = "with another episode's touch the last cost is no higher"
         if other is not None and other.low > 0:
             rise = other.replaced - other.real
             swapped = f"with another episode's touch the last cost is {rise:.2f} higher"
-        return f"touch mattered: shuffled in time, the cost's order changes by {change}; {swapped}"
+        return (
+            f"touch mattered: shuffled in time, the cost's order changes by {row.change}; {swapped}"
+        )
 
     @property
     def table(self) -> str:
@@ -98,25 +92,20 @@ class AuditTable:
         head = f"{'metric':<11}{'touch':<11}{'real':>7}{'replaced':>10}   difference, 95 % interval"
         lines = [f"touch-use audit of {self.episodes} episodes", head]
         for r in self.rows:
-            if r.real != r.real:
-                lines.append(f"{r.metric:<11}{r.replacement:<11}{'-':>7}{'-':>10}   undefined")
-                continue
-            interval = f"{r.replaced - r.real:+.2f} [{r.low:.2f}, {r.high:.2f}]"
-            line = (
-                f"{r.metric:<11}{r.replacement:<11}{r.real:>7.2f}{r.replaced:>10.2f}   {interval}"
-            )
-            lines.append(line)
+            values = f"{'-':>7}{'-':>10}   undefined"
+            if r.real == r.real:
+                values = f"{r.real:>7.2f}{r.replaced:>10.2f}   {r.change}"
+            lines.append(f"{r.metric:<11}{r.replacement:<11}{values}")
         return "\n".join([*lines, self.verdict])
 
     def _row(self, metric: str, replacement: str) -> AuditRow | None:
-        found = [r for r in self.rows if (r.metric, r.replacement) == (metric, replacement)]
-        return found[0] if found else None
+        return next(
+            (r for r in self.rows if (r.metric, r.replacement) == (metric, replacement)), None
+        )
 
 
 def audit_touch(
-    episodes: Sequence[EmbeddedEpisode],
-    goals: Sequence[EmbeddedGoal],
-    measure: Measure,
+    episodes: Sequence[EmbeddedEpisode], goals: Sequence[EmbeddedGoal], measure: Measure
 ) -> AuditTable:
     """Return how each metric of the fused cost changes with each replacement of touch.
 
@@ -157,7 +146,7 @@ def audit_trajectories(
     for trajectory in track(trajectories, "auditing", "trajectory"):
         reward = rewards[trajectory.name]
         embedded.append(embed_trajectory(reward.embedder, trajectory))
-        goals.append(reward.embedder.embed_goal(reward.goal, embedded[-1]))
+        goals.append(reward.embedder.embed_goal(reward.goals, embedded[-1]))
     reward = rewards[trajectories[0].name]
 
     def measure(episode: EmbeddedEpisode, goal: EmbeddedGoal) -> Curves:
@@ -183,46 +172,26 @@ def _replace(
     name: str, episodes: Sequence[EmbeddedEpisode], k: int, rng: np.random.Generator
 ) -> EmbeddedEpisode:
     """Return episode k with its touch replaced as `REPLACEMENTS` says."""
-    episode = episodes[k]
-    n, sides = len(episode), np.arange(len(episode.sides))
-    rows = np.arange(n)
-    match name:
-        case "neutral":
-            return _with_touch(episode, episode, np.zeros(n, int), sides)
-        case "shuffled":
-            return _with_touch(episode, episode, rng.permutation(n), sides)
-        case "shifted":
-            late = round(_SHIFT * episode.fps)
-            return _with_touch(episode, episode, np.maximum(rows - late, 0), sides)
-        case "mirrored":
-            return _with_touch(episode, episode, rows, sides[::-1])
-        case _:
-            other = _another(episodes, k)
-            scaled = np.rint(np.linspace(0, len(other) - 1, n)).astype(int)
-            return _with_touch(episode, other, scaled, sides)
-
-
-def _another(episodes: Sequence[EmbeddedEpisode], k: int) -> EmbeddedEpisode:
-    """Return the next episode with another object, or the next one if all have the same."""
-    later = [*episodes[k + 1 :], *episodes[:k]]
-    return next((e for e in later if e.object != episodes[k].object), later[0])
-
-
-def _with_touch(
-    episode: EmbeddedEpisode,
-    source: EmbeddedEpisode,
-    rows: Int[np.ndarray, " n"],
-    sides: Int[np.ndarray, " s"],
-) -> EmbeddedEpisode:
-    """Return an episode with touch from rows and sides of a source."""
-    felt = {k: v[rows][:, sides] for k, v in source.features.items() if k in FINGERTIPS}
-    return replace(episode, features={**episode.features, **felt})
+    episode = source = episodes[k]
+    rows, sides = np.arange(len(episode)), np.arange(len(episode.sides))
+    if name == "neutral":
+        rows = np.zeros_like(rows)
+    elif name == "shuffled":
+        rows = rng.permutation(rows)
+    elif name == "shifted":
+        rows = np.maximum(rows - round(_SHIFT * episode.fps), 0)
+    elif name == "mirrored":
+        sides = sides[::-1]
+    else:
+        later = [*episodes[k + 1 :], *episodes[:k]]
+        source = next((e for e in later if e.object != episode.object), later[0])
+        rows = np.rint(np.linspace(0, len(source) - 1, len(episode))).astype(int)
+    touch = {n: v[rows][:, sides] for n, v in source.features.items() if n in FINGERTIPS}
+    return replace(episode, features={**episode.features, **touch})
 
 
 def _measured(
-    episodes: Sequence[EmbeddedEpisode],
-    goals: Sequence[EmbeddedGoal],
-    measure: Measure,
+    episodes: Sequence[EmbeddedEpisode], goals: Sequence[EmbeddedGoal], measure: Measure
 ) -> dict[str, Float[np.ndarray, " episodes"]]:
     """Return each metric of each episode, NaN where it is undefined."""
     found = []

@@ -18,51 +18,24 @@ if TYPE_CHECKING:
     from touchgoal.rewards.reward_wrapper import RewardWrapper
 
 Touch = Literal["image", "embedding"]
+_No = Literal[False]
 _BY_NAME = {env.task: env for env in ENVIRONMENTS.values()}
 
 
 @overload
 def make(
-    task: Literal["pick-place"],
-    *,
-    for_rl: Literal[False] = False,
-    reward: None = None,
-    **options: Any,
-) -> PickPlace: ...
-@overload
-def make(
-    task: Literal["bead-maze"],
-    *,
-    for_rl: Literal[False] = False,
-    reward: None = None,
-    **options: Any,
-) -> BeadMaze: ...
-@overload
-def make(
-    task: Literal["fragile-carry"],
-    *,
-    for_rl: Literal[False] = False,
-    reward: None = None,
-    **options: Any,
-) -> FragileCarry: ...
-@overload
-def make(
-    task: str,
-    *,
-    for_rl: Literal[False] = False,
-    reward: "Reward",
-    **options: Any,
+    task: str, *, reward: "Reward", for_rl: _No = False, **options: Any
 ) -> "RewardWrapper": ...
 @overload
+def make(task: Literal["pick-place"], *, for_rl: _No = False, **options: Any) -> PickPlace: ...
+@overload
+def make(task: Literal["bead-maze"], *, for_rl: _No = False, **options: Any) -> BeadMaze: ...
+@overload
 def make(
-    task: str,
-    *,
-    for_rl: Literal[True],
-    reward: "Reward | None" = None,
-    touch: Touch = "image",
-    encoder: str | Path | None = None,
-    **options: Any,
-) -> ForRL: ...
+    task: Literal["fragile-carry"], *, for_rl: _No = False, **options: Any
+) -> FragileCarry: ...
+@overload
+def make(task: str, *, for_rl: Literal[True], **options: Any) -> ForRL: ...
 def make(
     task: str,
     *,

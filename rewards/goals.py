@@ -218,9 +218,9 @@ def content_checksum(spec: "GoalSpec") -> str:
     return str(spec)
 
 
-ImageGoal = OwnFrame | GoalImage | EpisodeEnd | Bank | GoalFile | Sentence
-TouchGoal = OwnFrame | TouchArrays | EpisodeEnd | Bank | GoalFile
-GoalSpec = ImageGoal | TouchGoal
+GoalSpec = OwnFrame | GoalImage | TouchArrays | EpisodeEnd | Bank | GoalFile | Sentence
+Goals = Mapping[Modality, GoalSpec]
+"""The goal of each modality that has one."""
 GoalLike = GoalSpec | str | int | np.ndarray | Mapping[str, np.ndarray]
 """A goal in a script; see `touchgoal.Reward`."""
 
@@ -228,29 +228,9 @@ SIDES = {"left": TACTILE_LEFT, "right": TACTILE_RIGHT}
 """Names of the fingertips in a script, and their keys."""
 
 
-@dataclass(frozen=True)
-class Goal:
-    """The goal of each modality; None without one."""
-
-    image: ImageGoal | None = None
-    tactile: TouchGoal | None = None
-    text: Sentence | None = None
-
-    @property
-    def same_episode(self) -> frozenset[str]:
-        """Modalities whose goal is a frame of the measured trajectory itself."""
-        return frozenset(m for m in MODALITIES if isinstance(getattr(self, m), OwnFrame))
-
-    @property
-    def specs(self) -> list[GoalSpec]:
-        """Goals of all modalities that have one."""
-        given = (getattr(self, name) for name in MODALITIES)
-        return [spec for spec in given if spec is not None]
-
-    def as_dict(self) -> dict[str, str]:
-        """Return the goal of each modality that has one, in the form that a user writes."""
-        specs = {name: getattr(self, name) for name in MODALITIES}
-        return {name: str(spec) for name, spec in specs.items() if spec is not None}
+def same_episode(goals: Goals) -> frozenset[str]:
+    """Return the modalities whose goal is a frame of the measured trajectory itself."""
+    return frozenset(m for m, spec in goals.items() if isinstance(spec, OwnFrame))
 
 
 def parse_goal(text: str, keys: Mapping[str, str] | None = None) -> GoalSpec:
@@ -312,7 +292,7 @@ def _goals_of_arrays(goal: Mapping[str, np.ndarray]) -> list[GoalSpec]:
 
 def assign_goals(
     specs: Sequence[GoalSpec], available: Sequence[Modality], image_words: bool = False
-) -> Goal:
+) -> Goals:
     """Give each available modality the first goal that applies to it.
 
     With `image_words`, of towers that compare images with sentences, a sentence is a goal for
@@ -320,9 +300,9 @@ def assign_goals(
     """
     if not specs:
         raise UserError(f"no goal was given; write {FORMS}")
-    taken: dict[str, GoalSpec] = {}
+    taken: dict[Modality, GoalSpec] = {}
     for spec in specs:
-        wanted = [m for m in spec.modalities if m in available]
+        wanted: list[Modality] = [m for m in spec.modalities if m in available]
         if isinstance(spec, Sentence) and not wanted:
             if not image_words:
                 raise UserError(_no_words(spec))
@@ -339,27 +319,21 @@ def assign_goals(
                 f"{' and '.join(wanted)}; put it first or leave it out"
             )
         taken |= dict.fromkeys(free, spec)
-    image, touch, text = (taken.get(name) for name in MODALITIES)
-    assert isinstance(image, ImageGoal | None) and isinstance(touch, TouchGoal | None)
-    assert isinstance(text, Sentence | None)
-    return Goal(image, touch, text)
+    return {name: taken[name] for name in MODALITIES if name in taken}
 
 
-def check_goal(goal: Goal, inputs: Inputs) -> None:
-    """Check before any work that a goal can be read.
+def check_goals(goals: Goals, inputs: Inputs) -> None:
+    """Check before any work that goals can be read.
 
     UserError: a frame beyond the trajectory; no such image, set, episode, camera or fingertip.
     """
-    for spec in (goal.image, goal.tactile):
+    for modality, spec in goals.items():
         if isinstance(spec, OwnFrame) and inputs.length is not None:
             frame_index(spec, inputs.length, inputs.name)
-    if isinstance(goal.image, GoalImage):
-        goal.image.read()
-    if isinstance(goal.image, EpisodeEnd):
-        goal.image.read([inputs.camera or FRONT])
-    if isinstance(goal.tactile, EpisodeEnd):
-        goal.tactile.read(inputs.sides)
-    for spec in (goal.image, goal.tactile):
+        if isinstance(spec, GoalImage):
+            spec.read()
+        if isinstance(spec, EpisodeEnd):
+            spec.read([inputs.camera or FRONT] if modality == "image" else inputs.sides)
         if isinstance(spec, Bank):
             spec.ends()
         if isinstance(spec, GoalFile) and not spec.path.is_file():

@@ -19,7 +19,7 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_trajectory, kept_file
-from touchgoal.rewards.goals import GoalSpec, Inputs, content_checksum
+from touchgoal.rewards.goals import Inputs, content_checksum
 from touchgoal.rewards.report.record import record_of
 from touchgoal.rewards.report.report import write_report
 from touchgoal.rewards.report.thumbnails import Thumbnails
@@ -48,16 +48,8 @@ class EncoderOptions:
     parts: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Embedded:
-    """A trajectory that was read and embedded."""
-
-    trajectory: Trajectory
-    embedded: EmbeddedEpisode
-    thumbnails: Thumbnails
-
-
-Embed = Callable[[Sequence[Trajectory], Count], Iterator[Embedded | Skipped]]
+Result = tuple[EmbeddedEpisode, Thumbnails] | Skipped
+Embed = Callable[[Sequence[Trajectory], Count], Iterator[Result]]
 """Embeds trajectories in their order."""
 
 
@@ -78,9 +70,11 @@ class Measurement:
             plots: number of trajectories, from the first, that get a plot.
         """
         self._out, self._rewards = out, rewards
-        self._contents: dict[str, str] = {}
+        # thousands of trajectories share a goal, whose content is read once
+        goals = {str(goal): goal for reward in rewards.values() for goal in reward.goals.values()}
+        contents = {name: content_checksum(goal) for name, goal in goals.items()}
         self._plotted = {t.name for t in trajectories[:plots]}
-        self._paths = {t.name: self._path(t) for t in trajectories}
+        self._paths = {t.name: self._path(t, contents) for t in trajectories}
         self.missing = [t for t in trajectories if not self._paths[t.name].is_file()]
         self.skipped: list[Skipped] = []
 
@@ -97,11 +91,10 @@ class Measurement:
         """
         done, began = 0, time.perf_counter()
         with progress_bar("measuring", sum(t.length for t in self.missing), "frame") as bar:
-            for trajectory, result in zip(
-                self.missing, embed(self.missing, bar.update), strict=True
-            ):
+            results = embed(self.missing, bar.update)
+            for trajectory, result in zip(self.missing, results, strict=True):
                 try:
-                    self._measure(result)
+                    self._measure(trajectory, result)
                 except UserError as error:
                     self.skipped.append(Skipped(trajectory.name, str(error)))
                 done += trajectory.length
@@ -111,27 +104,20 @@ class Measurement:
         rate = f"{done / seconds:.1f} a second, at most {memory:.2f} GB of memory"
         return f"{done:,} frames in {seconds:.0f} s: {rate}"
 
-    def _measure(self, result: Embedded | Skipped) -> None:
+    def _measure(self, trajectory: Trajectory, result: Result) -> None:
         if isinstance(result, Skipped):
             self.skipped.append(result)
             return
-        trajectory, name = result.trajectory, result.trajectory.name
+        (embedded, thumbnails), name = result, trajectory.name
         reward = self._rewards[name]
-        curves = reward.curves(result.embedded)
+        curves = reward.curves(embedded)
         write_report(curves, self._out, name, reward.provenance(), name in self._plotted)
         path = self._paths[name]
         for stale in path.parent.glob(f"{name}.*.npz"):
             stale.unlink()
-        record_of(curves, trajectory, result.thumbnails).save(path)
+        record_of(curves, trajectory, thumbnails).save(path)
 
-    def _content(self, spec: GoalSpec) -> str:
-        """Return the checksum of a goal's content, read once: thousands of trajectories share it."""
-        key = str(spec)
-        if key not in self._contents:
-            self._contents[key] = content_checksum(spec)
-        return self._contents[key]
-
-    def _path(self, trajectory: Trajectory) -> Path:
+    def _path(self, trajectory: Trajectory, contents: Mapping[str, str]) -> Path:
         """Return the path of a record, which names the recording and what it was measured with."""
         reward = self._rewards[trajectory.name]
         made_of = [
@@ -139,8 +125,7 @@ class Measurement:
             trajectory.checksum(),
             reward.provenance(),
             reward.plain,
-            reward.goal.as_dict(),
-            [self._content(spec) for spec in reward.goal.specs],
+            {m: (str(goal), contents[str(goal)]) for m, goal in reward.goals.items()},
             repr(reward.normalizer),
             checksum(*(reward.value.state_dict().values() if reward.value else ())),
         ]
@@ -150,7 +135,7 @@ class Measurement:
 
 def embed_here(
     trajectories: Sequence[Trajectory], count: Count, embedder: EpisodeEmbedder
-) -> Iterator[Embedded | Skipped]:
+) -> Iterator[Result]:
     """Embed in this process, while threads read ahead what is not embedded yet."""
     kept = {t.name for t in trajectories if (p := kept_file(embedder, t)) and p.is_file()}
     reading = read_ahead(t for t in trajectories if t.name not in kept)
@@ -161,7 +146,7 @@ def embed_here(
 
 def embed_on_ray(
     trajectories: Sequence[Trajectory], count: Count, options: EncoderOptions, address: str
-) -> Iterator[Embedded | Skipped]:
+) -> Iterator[Result]:
     """Embed each trajectory on a core of a Ray cluster, whose nodes read the same files."""
     with parallel_map(partial(_embed_apart, options), trajectories, address) as results:
         for trajectory, result in zip(trajectories, results, strict=True):
@@ -169,7 +154,7 @@ def embed_on_ray(
             yield result
 
 
-def _embed_apart(options: EncoderOptions, trajectory: Trajectory) -> Embedded | Skipped:
+def _embed_apart(options: EncoderOptions, trajectory: Trajectory) -> Result:
     return _embed(_load(options), trajectory, trajectory.chunks())
 
 
@@ -179,9 +164,7 @@ def _load(options: EncoderOptions) -> EpisodeEmbedder:
     return reward.embedder(options.inputs, options.parts)
 
 
-def _embed(
-    embedder: EpisodeEmbedder, trajectory: Trajectory, chunks: Iterable[Episode]
-) -> Embedded | Skipped:
+def _embed(embedder: EpisodeEmbedder, trajectory: Trajectory, chunks: Iterable[Episode]) -> Result:
     thumbnails = Thumbnails(trajectory.length)
     try:
         embedded = embed_trajectory(embedder, trajectory, thumbnails.collect(chunks))
@@ -189,7 +172,7 @@ def _embed(
             thumbnails.add(trajectory.read(thumbnails.planned))
     except UserError as error:
         return Skipped(trajectory.name, str(error))
-    return Embedded(trajectory, embedded, thumbnails)
+    return embedded, thumbnails
 
 
 def _counted(chunks: Iterable[Episode], count: Count) -> Iterator[Episode]:

@@ -23,7 +23,7 @@ from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.normalizer import REAL_SCENE
 from touchgoal.rewards.features.embedded import EmbeddedGoal
 from touchgoal.rewards.features.embedder import FeatureStream
-from touchgoal.rewards.goals import Inputs, parse_goal
+from touchgoal.rewards.goals import Inputs, parse_goal, same_episode
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.reward import PreparedReward, Reward
 from touchgoal.runtime.errors import UserError
@@ -50,9 +50,9 @@ class CostMeter:
             object_name: object of the run, which chooses among the goals; "" if unknown.
             rate: ticks per second.
         """
-        if reward.goal.same_episode:
+        if same_episode(reward.goals):
             raise UserError("goals last and frame:K are not known before the end of a run")
-        if reward.normalizer is None and len(reward.goal.as_dict()) > 1:
+        if reward.normalizer is None and len(reward.goals) > 1:
             raise UserError(
                 "raw distances of several modalities cannot be averaged: give one "
                 "goal of one modality (image:PATH or text:SENTENCE), or a normalizer"
@@ -79,7 +79,7 @@ class CostMeter:
         trajectory = replace(self._stream.embed(_stacked(ticks)), object=self._object)
         reward = self._reward
         if self._goal is None:
-            self._goal = reward.embedder.embed_goal(reward.goal, trajectory)
+            self._goal = reward.embedder.embed_goal(reward.goals, trajectory)
         curves = compute_curves(
             trajectory, self._goal, reward.normalizer, reward.value, self._parts, reward.plain
         )

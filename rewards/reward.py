@@ -17,27 +17,23 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.cost import compute_curves
-from touchgoal.rewards.distance.normalizer import (
-    NORMALIZER,
-    REMEDY,
-    DistanceNormalizer,
-    scene_of,
-)
+from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNormalizer, scene_of
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_trajectory
 from touchgoal.rewards.goals import (
     SIDES,
-    Goal,
     GoalLike,
+    Goals,
     GoalSpec,
     Inputs,
     OwnFrame,
     TouchArrays,
     assign_goals,
-    check_goal,
+    check_goals,
     check_words,
     goals_of_script,
+    same_episode,
 )
 from touchgoal.rewards.sources.episode_trajectories import default_goals
 from touchgoal.rewards.sources.open_source import open_source
@@ -55,7 +51,7 @@ class PreparedReward:
     """A reward for recordings of one kind: encoders, goals and normalizer."""
 
     embedder: EpisodeEmbedder
-    goal: Goal  # the goal of each modality
+    goals: Goals  # the goal of each modality
     normalizer: DistanceNormalizer | None  # normalizer of the distances; None for raw ones
     value: Value | None  # value of the task, if one lies beside the normalizer
     note: str  # which normalizer, or why there is none, for people
@@ -65,7 +61,7 @@ class PreparedReward:
         self, trajectory: EmbeddedEpisode, before: Mapping[str, float] | None = None
     ) -> Curves:
         """Return the curves of a trajectory that `embedder` embedded; `before`: `compute_curves`."""
-        goal = self.embedder.embed_goal(self.goal, trajectory)
+        goal = self.embedder.embed_goal(self.goals, trajectory)
         curves = compute_curves(
             trajectory, goal, self.normalizer, self.value, before, plain=self.plain
         )
@@ -204,15 +200,15 @@ class Reward:
         together = towers not in (None, OfflineTowers.name)
         if towers is not None and not isinstance(towers, str):
             together = towers.pretrained_together
-        goal = assign_goals(specs, inputs.modalities, together)
-        check_goal(goal, inputs)
+        assigned = assign_goals(specs, inputs.modalities, together)
+        check_goals(assigned, inputs)
         embedder = self.embedder(inputs)
         check_words(specs, embedder.encoder is None or embedder.knows_words)
-        normalizer, value, note = self._choose_normalizer(inputs, goal, embedder)
+        normalizer, value, note = self._choose_normalizer(inputs, assigned, embedder)
         parts = normalizer is not None and bool(normalizer.unit) and not self._plain
         if not parts:
             embedder = self.embedder(inputs, parts=False)
-        return PreparedReward(embedder, goal, normalizer, value, note, self._plain)
+        return PreparedReward(embedder, assigned, normalizer, value, note, self._plain)
 
     def prepare_source(self, source: Source) -> dict[str, PreparedReward]:
         """Prepare for each trajectory of a source, by name; see `prepare`."""
@@ -259,13 +255,13 @@ class Reward:
         return self._encoders[inputs.sensor]
 
     def _choose_normalizer(
-        self, inputs: Inputs, goal: Goal, embedder: EpisodeEmbedder
+        self, inputs: Inputs, goals: Goals, embedder: EpisodeEmbedder
     ) -> tuple[DistanceNormalizer | None, Value | None, str]:
         """Return the normalizer, the value beside it, and which ones these are, for people."""
         if self._choice == "none":
             return None, None, "normalizer: none, raw cosine distances"
         if (given := self._given) is not None:
-            if reason := _mismatch(given, goal, embedder):
+            if reason := _mismatch(given, goals, embedder):
                 raise UserError(f"{self._name} does not apply here: {reason}; {REMEDY}")
             value, reason = _value_in(self._folder, inputs, embedder)
             if reason:
@@ -274,7 +270,7 @@ class Reward:
             return given, value, f"normalizer: {self._name}{beside}"
         folder = self._touch_encoder(inputs)[1]
         scene = inputs.scene if self._choice is None else None
-        found, reason = _normalizer_in(folder, scene, goal, embedder)
+        found, reason = _normalizer_in(folder, scene, goals, embedder)
         if found is None and self._choice == "encoder":
             raise UserError(f"the encoder's normalizer does not apply: {reason}; {REMEDY}")
         if found is None:
@@ -343,12 +339,14 @@ def _shipped_for(inputs: Inputs) -> Path:
         raise UserError(f"{error}; {images_alone}") from None
 
 
-def _mismatch(normalizer: DistanceNormalizer, goal: Goal, embedder: EpisodeEmbedder) -> str | None:
-    return normalizer.mismatch(embedder.made_with, goal.as_dict(), goal.same_episode)
+def _mismatch(
+    normalizer: DistanceNormalizer, goals: Goals, embedder: EpisodeEmbedder
+) -> str | None:
+    return normalizer.mismatch(embedder.made_with, goals, same_episode(goals))
 
 
 def _normalizer_in(
-    folder: Path | None, scene: str | None, goal: Goal, embedder: EpisodeEmbedder
+    folder: Path | None, scene: str | None, goals: Goals, embedder: EpisodeEmbedder
 ) -> tuple[DistanceNormalizer | None, str]:
     """Return the normalizer in an encoder's folder and its path, or None and why it is not used.
 
@@ -360,7 +358,7 @@ def _normalizer_in(
     if not path.is_file():
         return None, f"there is no {path}"
     found = DistanceNormalizer.load(path)
-    reason = _mismatch(found, goal, embedder)
+    reason = _mismatch(found, goals, embedder)
     if scene is not None and found.scene != scene:
         reason = f"it was fitted on {found.scene} episodes and the scene here is {scene}"
     return (None, f"{path} does not apply: {reason}") if reason else (found, str(path))

@@ -1,12 +1,11 @@
 """The cost to a goal as the reward of a Gymnasium environment."""
 
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE, Observation
-from touchgoal.rewards.curves import GAMMA
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.online import CostMeter
@@ -35,30 +34,18 @@ def inputs_of(env: gym.Env) -> Inputs:
 class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
     """Replaces an environment's reward by one from the cost to a goal outside the episode.
 
-    The potential form pays the fall of the cost, cost_before - gamma cost: with gamma 1 holding still
-    pays nothing, and the return depends only on the first and the last cost. The state form pays
-    -cost. `info` has the `cost` and the environment's own reward as `task_reward`. The potential of
-    the last state is not set to zero.
+    A step pays the fall of the cost: holding still pays nothing, and the return depends only on the
+    first and the last cost. `info` has the `cost` and the environment's own reward as `task_reward`.
     """
 
-    def __init__(
-        self,
-        env: gym.Env,
-        reward: Reward,
-        form: Literal["potential", "state"] = "potential",
-        gamma: float = GAMMA,
-    ) -> None:
+    def __init__(self, env: gym.Env, reward: Reward) -> None:
         """Wrap an environment whose observations have touchgoal's keys.
 
         UserError: a goal inside the episode, or one that the observations cannot be compared with.
-
-        Args:
-            gamma: discount per second of the potential form. For an algorithm that discounts by g per
-                step it is g to the power of the steps per second.
         """
         super().__init__(env)
         rate = getattr(getattr(env.unwrapped, "config", None), "control_hz", CONTROL_HZ)
-        self._rate, self._form, self._gamma = float(rate), form, gamma ** (1 / rate)
+        self._rate = float(rate)
         self._reward = reward.prepare(inputs_of(env))
         self._meter = CostMeter(self._reward, rate=self._rate)
         self._first: list[Observation] = []
@@ -79,8 +66,7 @@ class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray
         observation, reward, terminated, truncated, info = self.env.step(action)
         before, self._cost = self._cost, self._measure(observation)
         info = {**info, "cost": self._cost, "task_reward": reward}
-        paid = before - self._gamma * self._cost if self._form == "potential" else -self._cost
-        return observation, paid, terminated, truncated, info
+        return observation, before - self._cost, terminated, truncated, info
 
     def _measure(self, observation: Observation) -> float:
         if len(self._first) < START_FRAMES:

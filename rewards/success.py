@@ -10,14 +10,12 @@ value cost too little.
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
-from touchgoal.episodes.outcomes.generate import MADE, made_failures
-from touchgoal.episodes.schema import Episode
 from touchgoal.rewards.curves import FUSED
 from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
@@ -103,30 +101,6 @@ def last_costs(
             )
         costs.append(float(curves[FUSED][-1]))
     return costs
-
-
-def accepted_failures(
-    threshold: SuccessThreshold,
-    successes: Sequence[Episode],
-    last_cost: Callable[[Episode], float],
-) -> dict[str, tuple[int, int]]:
-    """Return how many failures made from successes pass a threshold, of how many, by kind.
-
-    The kind "wrong_object" takes its touch from the next success with another object; without one it
-    is not made. A failure whose images `last_cost` refuses (UserError) does not pass.
-    """
-    passed: dict[str, list[bool]] = {kind: [] for kind in MADE}
-    for k, success in enumerate(successes):
-        later = [*successes[k + 1 :], *successes[:k]]
-        others = [e for e in later if e.meta.get("object") != success.meta.get("object")]
-        for kind, failure in made_failures(success, (others or [success])[0]).items():
-            if kind == "wrong_object" and not others:
-                continue
-            try:
-                passed[kind].append(threshold.accepts(last_cost(failure)))
-            except UserError:
-                passed[kind].append(False)
-    return {kind: (sum(accepted), len(accepted)) for kind, accepted in passed.items() if accepted}
 
 
 def load_success_threshold(normalizer: str | Path | None) -> SuccessThreshold | None:

@@ -39,15 +39,16 @@ from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.goals import (
     Bank,
     EpisodeEnd,
-    Goal,
     GoalFile,
     GoalImage,
-    ImageGoal,
+    Goals,
+    GoalSpec,
     OwnFrame,
     Sentence,
-    TouchGoal,
+    TouchArrays,
     frame_index,
     missing_camera,
+    same_episode,
 )
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
@@ -170,22 +171,23 @@ class EpisodeEmbedder:
     def _sides(self, frames: Frames) -> tuple[str, ...]:
         return tuple(key for key in TACTILE if key in frames) if self.encoder else ()
 
-    def embed_goal(self, goal: Goal, own: EmbeddedEpisode) -> EmbeddedGoal:
-        """Embed a goal for one trajectory; frames of `own` are not embedded again.
+    def embed_goal(self, goals: Goals, own: EmbeddedEpisode) -> EmbeddedGoal:
+        """Embed the goals of one trajectory; frames of `own` are not embedded again.
 
         UserError: a frame beyond the trajectory, an unreadable image or episode, or an episode
         with other fingertips.
         """
         features: dict[str, np.ndarray] = {}
-        if goal.image is not None:
-            features |= self._goal_of_images(goal.image, own)
-        if goal.tactile is not None:
-            features |= self._goal_of_touch(goal.tactile, own)
-        if goal.text is not None:
-            features[TEXT] = self.embed_sentences([goal.text.text])
-            if goal.text.baseline:
-                features[TEXT_BASELINE] = self.embed_sentences([goal.text.baseline])
-        return EmbeddedGoal(features, goal.as_dict(), goal.same_episode)
+        if "image" in goals:
+            features |= self._goal_of_images(goals["image"], own)
+        if "tactile" in goals:
+            features |= self._goal_of_touch(goals["tactile"], own)
+        if isinstance(text := goals.get("text"), Sentence):
+            features[TEXT] = self.embed_sentences([text.text])
+            if text.baseline:
+                features[TEXT_BASELINE] = self.embed_sentences([text.baseline])
+        forms = {name: str(spec) for name, spec in goals.items()}
+        return EmbeddedGoal(features, forms, same_episode(goals))
 
     def embed_cameras(self, frames: Frames) -> Features:
         """Return image, and with parts the pooled features and map of each camera."""
@@ -224,7 +226,7 @@ class EpisodeEmbedder:
     def _embed_images(self, frames: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, "n d"]:
         return _unit(self._towers.embed_images(frames))
 
-    def _goal_of_images(self, spec: ImageGoal, own: EmbeddedEpisode) -> Features:
+    def _goal_of_images(self, spec: GoalSpec, own: EmbeddedEpisode) -> Features:
         main = self.camera or FRONT
         if isinstance(spec, Sentence):
             assert self._towers.pretrained_together  # or a sentence is no goal for images
@@ -239,9 +241,10 @@ class EpisodeEmbedder:
                 last = {k: v[-1:] for k, v in frames.items() if is_camera(k)}
                 self._goals[key] = self.embed_cameras(last)
             return self._goals[key]
+        assert isinstance(spec, OwnFrame | Bank | GoalFile)
         return split_features(self._end(spec, own))[0]
 
-    def _goal_of_touch(self, spec: TouchGoal, own: EmbeddedEpisode) -> Features:
+    def _goal_of_touch(self, spec: GoalSpec, own: EmbeddedEpisode) -> Features:
         if isinstance(spec, OwnFrame | Bank | GoalFile):
             return split_features(self._end(spec, own))[1]
         if isinstance(spec, EpisodeEnd):
@@ -251,6 +254,7 @@ class EpisodeEmbedder:
                 embedded = self.embed_episode(read, own.fps, str(spec))
                 self._goals[key] = split_features(last_rows([embedded]))[1]
             return self._goals[key]
+        assert isinstance(spec, TouchArrays)
         frames = {
             side: np.stack([*[spec.backgrounds[side]] * START_FRAMES, spec.images[side]])
             for side in own.sides

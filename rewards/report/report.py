@@ -14,7 +14,7 @@ from touchgoal.rewards.curves import GAMMA, Curves
 from touchgoal.rewards.report.frame_table import PROGRESS, write_frames, write_progress
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.plot import plot
-from touchgoal.rewards.report.record import Facts, columns_of, load_facts
+from touchgoal.rewards.report.record import columns_of, load_facts
 from touchgoal.rewards.report.tables import metrics_table, outcome_table, success_table
 from touchgoal.rewards.success import SuccessThreshold
 from touchgoal.runtime.atomic_write import write_file
@@ -22,11 +22,7 @@ from touchgoal.runtime.json_file import write_json
 
 
 def write_report(
-    curves: Curves,
-    folder: Path,
-    name: str,
-    provenance: Mapping[str, Any],
-    with_plot: bool = True,
+    curves: Curves, folder: Path, name: str, provenance: Mapping[str, Any], with_plot: bool = True
 ) -> dict[str, Path]:
     """Write NAME.csv, NAME.json and, on request, NAME.png, each atomically; return the paths by kind.
 
@@ -60,7 +56,8 @@ def report_all(
         audit: table of the touch-use audit; "" without one.
     """
     facts = [load_facts(path) for path in records]
-    write_metrics(facts, out)
+    about = [{"source": f.source, "object": f.object, "outcome": f.outcome} for f in facts]
+    write_json(out / "metrics.json", [a | f.measured for a, f in zip(about, facts, strict=True)])
     write_frames(records, facts, out, provenance)
     if facts[0].normalised:
         write_progress(records, out)
@@ -76,14 +73,6 @@ def report_all(
     if not facts[0].normalised:
         print(f"no {PROGRESS}: raw distances are no progress; normalise them (fit-normalizer)")
     print(f"page: {page}")
-
-
-def write_metrics(facts: Sequence[Facts], out: Path) -> None:
-    """Write the metrics of every trajectory to metrics.json."""
-    rows = [
-        {"source": f.source, "object": f.object, "outcome": f.outcome, **f.measured} for f in facts
-    ]
-    write_json(out / "metrics.json", rows)
 
 
 def report_json(curves: Curves, provenance: Mapping[str, Any]) -> dict[str, Any]:

@@ -76,21 +76,16 @@ def open_successes(
         if not sets:
             raise UserError(f"{skipped.name} is broken: {skipped.reason}")
         print(f"left out: {skipped.reason}", file=sys.stderr)
-    if not sets:
-        if sum(len(source.trajectories) for source in sources) < 2:
-            raise UserError("a normalizer needs at least two successful videos; give more of them")
-        return sources
-    [source] = sets
-    success = {t: t.meta.get("success") for t in source.trajectories}
-    unknown = [t for t, reached in success.items() if reached is None]
-    if unknown and not assume_success:
+    success = {t: t.meta.get("success") for source in sources for t in source.trajectories}
+    if sets and None in success.values() and not assume_success:
+        unknown = list(success.values()).count(None)
         raise UserError(
-            f"{len(unknown)} of {len(success)} episodes of {paths[0]} have no recorded "
-            "outcome: give --assume-success if they succeeded"
+            f"{unknown} of {len(success)} episodes of {paths[0]} have no recorded outcome: give "
+            "--assume-success if they succeeded"
         )
-    chosen = [t for t, reached in success.items() if reached is None or reached]
-    if len(chosen) < 2:
-        raise UserError(
-            f"a normalizer needs at least two successful episodes, {paths[0]} has {len(chosen)}"
-        )
-    return [replace(source, trajectories=chosen)]
+    if sets:
+        chosen = [t for t, reached in success.items() if reached is not False]
+        sources = [replace(sources[0], trajectories=chosen)]
+    if sum(len(source.trajectories) for source in sources) < 2:
+        raise UserError("a normalizer needs at least two successful episodes or videos")
+    return sources

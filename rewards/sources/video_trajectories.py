@@ -216,15 +216,9 @@ def _words(keys: Iterable[str]) -> str:
 
 
 def _summary(path: Path, opened: Sequence[VideoTrajectory]) -> str:
-    """Return number, length and rate, and the goals that images alone can take."""
+    """Return number, length and rate, for people."""
     first = opened[0]
     what = f"{first.length} frames at {first.fps:g} per second"
     if len(opened) > 1:
         what = f"{len(opened):,} trajectories, {sum(t.length for t in opened):,} frames"
-    text = f"{path.name}: {what}, {_words(first.clips)}"
-    if any(key in TACTILE for key in first.clips):
-        return text
-    return (
-        f"{text}, images alone. Goals are images: last, frame:K, image:PATH or episode:ROOT#K; a "
-        "sentence (text:...) needs towers that compare images with words: --towers CLIP"
-    )
+    return f"{path.name}: {what}, {_words(first.clips)}"

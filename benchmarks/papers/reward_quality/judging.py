@@ -21,7 +21,7 @@ from touchgoal.rewards.features.embedded import (
     EmbeddedGoal,
     last_rows,
 )
-from touchgoal.rewards.goals import Goal, OwnFrame, Sentence
+from touchgoal.rewards.goals import OwnFrame, Sentence
 from touchgoal.rewards.value import Value, fit_value
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
@@ -81,10 +81,10 @@ class Judge:
         embedder, found = load_embedder(self.files.encoder), []
         for r in track(recorded, "measuring own ends", "episode"):
             episode, words = self.files.load(r), None
-            own = embedder.embed_goal(Goal(image=OwnFrame(), tactile=OwnFrame()), episode)
+            own = embedder.embed_goal({"image": OwnFrame(), "tactile": OwnFrame()}, episode)
             if embedder.knows_words:
                 sentence = Sentence(SENTENCES[r.object])
-                goal = embedder.embed_goal(Goal(image=OwnFrame(), text=sentence), episode)
+                goal = embedder.embed_goal({"image": OwnFrame(), "text": sentence}, episode)
                 words = self.plain_curves(episode, goal)
             found.append((self.plain_curves(episode, own), words))
         return found
