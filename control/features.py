@@ -12,6 +12,15 @@ import numpy as np
 Observation = dict[str, np.ndarray]
 """One tick's observation: key -> array."""
 
+
+def read_only(observation: Observation) -> Observation:
+    """Return views of the arrays that cannot be written to; nothing is copied."""
+    views = {key: value.view() for key, value in observation.items()}
+    for view in views.values():
+        view.flags.writeable = False
+    return views
+
+
 STATE = "observation.state"
 COMMAND = "observation.command"
 TCP_POSE = "observation.tcp_pose"

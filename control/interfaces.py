@@ -71,6 +71,14 @@ class LoadReading:
     stamp: float
 
 
+@dataclass(frozen=True)
+class CostReading:
+    """Distance to the goal at one tick, which was handed over at `stamp`."""
+
+    cost: float
+    stamp: float
+
+
 @runtime_checkable
 class Arm(Protocol):
     """A position-controlled arm.
@@ -171,6 +179,21 @@ class Policy(Protocol):
 
         Keys and units of the observation: `control/features.py`.
         """
+        ...
+
+
+@runtime_checkable
+class Cost(Protocol):
+    """Measures how far ticks are from a goal, beside the loop."""
+
+    def begin(self, observation: Observation) -> None:
+        """Begin a run, and measure its state before the first tick; returns at once."""
+
+    def hand_over(self, observation: Observation) -> None:
+        """Take the next tick; returns at once."""
+
+    def read(self) -> CostReading:
+        """Return the newest cost; wait for the first, DriverError with the reason if none comes."""
         ...
 
 

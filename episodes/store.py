@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Shaped, UInt8
 
 from touchgoal.episodes.format import episode_table, remote, set_files
-from touchgoal.episodes.format.encoding import EncodedEpisode, data_file, encode, read_columns
+from touchgoal.episodes.format.encoding import EncodedEpisode, encode, read_columns, write_data_file
 from touchgoal.episodes.format.episode_table import EpisodePlace
 from touchgoal.episodes.format.foreign import foreign_file, refusal
 from touchgoal.episodes.format.metadata import SetMetadata
@@ -124,7 +124,9 @@ class EpisodeWriter:
             UserError: The episode is unsound or does not fit the set, which stays as it was; or
                 another process writes to the set.
         """
-        encoded = encode(episode, self._fps) if isinstance(episode, Episode) else episode
+        encoded = (
+            encode(episode, self._fps, self._root) if isinstance(episode, Episode) else episode
+        )
         description = encoded.description
         current = self._metadata or SetMetadata(self._fps, description.features)
         file_number = current.next_file_number
@@ -136,7 +138,7 @@ class EpisodeWriter:
             )
         for key, video in encoded.videos.items():
             write_file(self._root / set_files.video_path(key, file_number), video)
-        write_file(path, data_file(encoded, current.index_columns_for(description)))
+        write_data_file(path, encoded, current.index_columns_for(description))
         updated.write(self._root, first_file=len(updated.files) - 1)
         self._metadata = updated
         return len(self) - 1

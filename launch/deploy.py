@@ -143,13 +143,13 @@ def _deploy(
     episodes: Path,
     stream: "BackgroundStream | None",
 ) -> "Result":
-    from functools import partial
-
     from touchgoal.control.deployment.actors import make_actor
     from touchgoal.control.deployment.control_loop import Request
     from touchgoal.control.deployment.session import Session
     from touchgoal.control.deployment.terminal import HELP, Terminal
-    from touchgoal.launch.support.cell_run import check_cell, record_episode
+    from touchgoal.control.features import CONTROL_HZ
+    from touchgoal.episodes.episode_recorder import EpisodeRecorder
+    from touchgoal.launch.support.cell_run import check_cell
     from touchgoal.launch.support.confirm import confirm
 
     def request() -> Request:
@@ -169,12 +169,12 @@ def _deploy(
         cell=cell,
         connection=connection,
         safety=safety,
-        record=partial(record_episode, episodes),
+        recorder=EpisodeRecorder(episodes, CONTROL_HZ),
         execute=config.execute,
         make_actor=lambda loop: make_actor(cell, policy, safety, connection.truth, loop.commanded),
         operator_request=request,
         on_tick=on_tick,
-        cost=cost.latest_cost if cost else None,
+        cost=cost,
         camera_size=camera_size,
     )
     with terminal.watching():
@@ -197,7 +197,7 @@ def _shown_in(stream: "BackgroundStream", dt: float) -> "Callable[[TickStatus], 
         tick = {**status.reading.observation}
         tick[ft.ACTION] = np.append(status.state.velocity * dt, status.width)
         if status.cost is not None:
-            tick[ft.COST] = np.array([status.cost])
+            tick[ft.COST] = np.array([status.cost.cost])
         images, scalars = parts_of(tick, "arm")
         for key, depth in zip(ft.TACTILE, status.reading.indentation, strict=True):
             if key in tick:

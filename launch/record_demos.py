@@ -113,8 +113,9 @@ def _put_back(config: Config, connection: "CellConnection", safety: "ActionFilte
     """Let a person lead the arm without a record; the ending is `done` once they are ready."""
     from contextlib import closing
 
-    from touchgoal.control.deployment.control_loop import ControlLoop, RunLog
+    from touchgoal.control.deployment.control_loop import ControlLoop
     from touchgoal.control.deployment.terminal import Terminal
+    from touchgoal.control.run_log import RunLog
     from touchgoal.control.teleoperation.teleoperator import Teleoperator
 
     with closing(_open_device(config, connection, 0)) as device:
@@ -138,13 +139,12 @@ def _record(
     episodes: Path,
 ) -> "Result":
     from contextlib import closing
-    from functools import partial
 
     from touchgoal.control.deployment.session import Session
     from touchgoal.control.deployment.terminal import RECORDING_HELP, Terminal
     from touchgoal.control.teleoperation.keyboard_device import HELP
     from touchgoal.control.teleoperation.teleoperator import Teleoperator
-    from touchgoal.launch.support.cell_run import record_episode
+    from touchgoal.episodes.episode_recorder import EpisodeRecorder
 
     with closing(_open_device(config, connection, cell.task.seed)) as device:
         terminal = Terminal(device.press)
@@ -152,7 +152,7 @@ def _record(
             cell=cell,
             connection=connection,
             safety=safety,
-            record=partial(record_episode, episodes),
+            recorder=EpisodeRecorder(episodes, CONTROL_HZ),
             execute=True,
             make_actor=lambda loop: Teleoperator(device, safety, loop.commanded, config.hand),
             operator_request=lambda: terminal.operator_request() or device.verdict,
@@ -189,5 +189,5 @@ def _save_goal_picture(result: "Result", path: Path) -> None:
 
     from touchgoal.control.features import FRONT
 
-    if FRONT in result.log.rows[-1]:
-        Image.fromarray(result.log.rows[-1][FRONT]).save(path)
+    if FRONT in result.log.newest:
+        Image.fromarray(result.log.newest[FRONT]).save(path)

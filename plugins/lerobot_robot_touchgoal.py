@@ -17,8 +17,9 @@ from touchgoal.control.cell.connection import (
     connect_cell,
 )
 from touchgoal.control.cell.limits import cell_limits
-from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop, RunLog
+from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop
 from touchgoal.control.interfaces import Actor, DriverError
+from touchgoal.control.run_log import RunLog
 from touchgoal.launch.support.cell_run import check_cell
 from touchgoal.launch.support.confirm import confirm
 from touchgoal.runtime.errors import UserError
@@ -95,7 +96,7 @@ class TouchgoalRobot(Robot):
             raise DriverError(str(ending))
         if not isinstance(clock, RealClock):  # a lock-step twin's time goes on only so
             clock.wait(clock.now() + 1 / ft.CONTROL_HZ)
-        return dict(zip(self._action, log.rows[-1][ft.ACTION].tolist(), strict=True))
+        return dict(zip(self._action, log.newest[ft.ACTION].tolist(), strict=True))
 
     def disconnect(self) -> None:
         """Bring the arm to rest and release the cell."""

@@ -17,6 +17,7 @@ from touchgoal.control.features import (
     WRENCH,
     Observation,
 )
+from touchgoal.control.interfaces import CostReading
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.rewards.curves import FUSED
 from touchgoal.rewards.distance.cost import compute_curves
@@ -60,7 +61,7 @@ class CostMeter:
         self._reward, self._object, self._rate = reward, object_name, rate
         self._goal: EmbeddedGoal | None = None
         self._stream: FeatureStream | None = None
-        self._background_ticks = 0  # that the stream's background is the median of
+        self._first: Sequence[Observation] = ()  # that the stream's background is the median of
         self._parts: dict[str, float] = {}  # cost of each part at the tick before
 
     def measure(self, observation: Observation, first: Sequence[Observation]) -> float:
@@ -69,13 +70,13 @@ class CostMeter:
         `first` are the run's first ticks in order, at most five. While more of them come in, the
         background changes, and they are measured anew.
         """
-        ticks = [observation]
-        if self._stream is None or len(first) > self._background_ticks:
+        ticks, known = [observation], self._first
+        if self._stream is None or len(first) != len(known) or first[0] is not known[0]:
             before = [tick for tick in first if tick is not observation]
             ticks = [*before, observation]
             embedder = self._reward.embedder
             self._stream = embedder.stream(_stacked(first), self._rate, "this run")
-            self._background_ticks, self._parts = len(first), {}
+            self._first, self._parts = first, {}
         trajectory = replace(self._stream.embed(_stacked(ticks)), object=self._object)
         reward = self._reward
         if self._goal is None:
@@ -100,57 +101,66 @@ class OnlineCost:
 
     def __init__(self, meter: CostMeter, give_up: float = 0.0) -> None:
         """Start the thread; `close` ends it. `give_up`: rise of the cost that is a failure; 0: none."""
-        self._meter = meter
-        self._watch = FailureWatch(give_up or float("inf"), CONTROL_HZ)
-        self.failed = False  # whether the cost has risen by `give_up` and stayed there for a second
-        self._first: tuple[Observation, ...] = ()  # ticks without contact
-        self._newest: tuple[Observation, tuple[Observation, ...]] | None = None
+        self._meter, self._rise = meter, give_up or float("inf")
+        self.failed = False  # whether the cost has risen by `give_up` for 20 measurements
+        self._first: tuple[Observation, ...] = ()  # the run's first ticks, without contact
+        self._newest: tuple[float, Observation, tuple[Observation, ...]] | None = None
         self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)
 
-    def latest_cost(self, observation: Observation) -> float:
-        """Hand over a tick; return the newest cost, of this tick or an earlier one.
+    def begin(self, observation: Observation) -> None:
+        """See Cost; the first measurement warms up the networks."""
+        self.failed, self._first = False, ()
+        self._watch, self._watched = FailureWatch(self._rise, CONTROL_HZ), time.monotonic()
+        self._newest = time.monotonic(), observation, (observation,)
 
-        Call it with every tick from the first on. The cost is the mean over the modalities that
-        have a goal: normalised, or the cosine distance without a normalizer. Only the first call
-        waits. DriverError, with the reason, if nothing can be measured.
-        """
+    def hand_over(self, observation: Observation) -> None:
+        """See Cost."""
         if len(self._first) < START_FRAMES:
             self._first = (*self._first, observation)
-        self._newest = observation, self._first
-        cost = self._latest.read()
-        self.failed = self.failed or self._watch.update(cost)
-        return cost
+        self._newest = time.monotonic(), observation, self._first
+
+    def read(self) -> CostReading:
+        """See Cost; the cost is the mean over the modalities that have a goal.
+
+        It is normalised, or the cosine distance without a normalizer.
+        """
+        reading = self._latest.read()
+        if reading.stamp > self._watched:
+            self._watched = reading.stamp
+            self.failed |= self._watch.update(reading.cost)
+        return reading
 
     def close(self) -> None:
         """End the thread."""
         self._latest.close()
 
-    def _measure_newest(self) -> float | None:
+    def _measure_newest(self) -> CostReading | None:
         newest, self._newest = self._newest, None
         if newest is None:
             time.sleep(_IDLE_SLEEP)
             return None
         torch.set_num_threads(1)  # of this thread: the control loop needs the other core
-        return self._meter.measure(*newest)
+        stamp, observation, first = newest
+        return CostReading(self._meter.measure(observation, first), stamp)
 
 
 class FailureWatch:
-    """Watches the cost of a run tick by tick.
+    """Watches the cost of a run, measurement by measurement.
 
-    The run has failed once the cost has stayed `rise` above its lowest value so far for `ticks`
-    ticks in a row: an object lost, or carried away from its goal. A run that gets nowhere keeps its
-    cost and is left to its time limit.
+    The run has failed once the cost has stayed `rise` above its lowest value so far for `n`
+    measurements in a row: an object lost, or carried away from its goal. A run that gets nowhere
+    keeps its cost and is left to its time limit.
     """
 
-    def __init__(self, rise: float, ticks: int) -> None:
-        self._rise, self._ticks = rise, ticks
+    def __init__(self, rise: float, n: int) -> None:
+        self._rise, self._n = rise, n
         self._lowest, self._above = float("inf"), 0
 
     def update(self, cost: float) -> bool:
-        """Take the cost of the next tick; return whether the run has failed."""
+        """Take the next cost; return whether the run has failed."""
         self._lowest = min(self._lowest, cost)
         self._above = self._above + 1 if cost > self._lowest + self._rise else 0
-        return self._above >= self._ticks
+        return self._above >= self._n
 
 
 def load_cell_cost(cell: CellConfig) -> OnlineCost:

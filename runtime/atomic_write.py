@@ -5,6 +5,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from mmap import mmap
 from pathlib import Path
 
 _FULL = 1_000_000  # bytes free, below which a failed write is blamed on the disk
@@ -34,7 +35,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     _sync(path.parent)
 
 
-def write_file(path: Path, data: bytes) -> None:
+def write_file(path: Path, data: bytes | mmap) -> None:
     """Write a file as `atomic_write` does."""
     with atomic_write(path) as unfinished:
         unfinished.write_bytes(data)

@@ -8,10 +8,20 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection
-from touchgoal.control.deployment.control_loop import ControlLoop, Ending, RunLog
-from touchgoal.control.interfaces import Actor, ArmReading, Frame, GripperReading, LoadReading
+from touchgoal.control.deployment.control_loop import ControlLoop, Ending
+from touchgoal.control.interfaces import (
+    Actor,
+    ArmReading,
+    Cost,
+    Frame,
+    GripperReading,
+    LoadReading,
+)
+from touchgoal.control.run_log import RunLog
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
+from touchgoal.control.tactile.sensor_calibration import load
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 
 SIM = """
 arm = "sim"
@@ -109,6 +119,18 @@ class FakeCamera:
     def close(self) -> None: ...
 
 
+class FakeFingertip(FakeCamera):
+    """A fingertip that nothing touches: one frame for ever, always new."""
+
+    model = GELSIGHT_MINI
+
+    def __init__(self, clock: FakeClock) -> None:
+        super().__init__(clock, load(self.model.sensor_file).background)
+
+    def read(self) -> Frame:
+        return Frame(self.image, 0, self.clock.time)
+
+
 @dataclass
 class FakeLoadCell:
     """A load cell that reads one force (N)."""
@@ -122,11 +144,23 @@ class FakeLoadCell:
     def close(self) -> None: ...
 
 
+class KeptTicks(list):
+    """A recorder that keeps the ticks."""
+
+    def add(self, tick: dict) -> None:
+        self.append(tick)
+
+    def save(self, task: str, meta: dict) -> int:
+        return 0
+
+    def close(self) -> None: ...
+
+
 class FakeCell:
     """Fake devices, and a run of the control loop on them.
 
     Attributes:
-        log: what the last run recorded.
+        log, rows: figures and ticks of the last run.
     """
 
     def __init__(self) -> None:
@@ -134,7 +168,7 @@ class FakeCell:
         self.arm, self.gripper = FakeArm(self.clock), FakeGripper(self.clock)
         self.load_cell: FakeLoadCell | None = None
         self.cameras: dict = {}
-        self.log = RunLog()
+        self.log, self.rows = RunLog(), KeptTicks()
 
     def connection(self) -> CellConnection:
         return CellConnection(FR3, self.arm, self.gripper, self.cameras, self.load_cell, self.clock)
@@ -146,6 +180,9 @@ class FakeCell:
         width: float = 0.04,
         seconds: float = 5.0,
         execute: bool = True,
+        log: RunLog | None = None,
+        cost: Cost | None = None,
+        actor: Actor | None = None,
     ) -> Ending:
         """`each_tick` gets the number of the tick before the actor acts in it.
 
@@ -154,10 +191,13 @@ class FakeCell:
             width: m asked of the gripper, which stands at 0.04 m: closer, it does not follow.
             seconds: after which it ends.
             execute: False: a dry run.
+            log: in place of one that keeps the ticks in `rows`.
+            actor: in place of the one described.
         """
         safety = ActionFilter(FR3, ft.CONTROL_HZ)
-        loop = ControlLoop(self.connection(), safety, execute, lambda: "", lambda _: None)
-        self.log = RunLog()
+        loop = ControlLoop(self.connection(), safety, execute, lambda: "", lambda _: None, cost)
+        self.rows = KeptTicks()
+        self.log = log or RunLog(self.rows.add)
 
         class Moves(Actor):
             ticks = 0
@@ -167,4 +207,4 @@ class FakeCell:
                 each_tick(self.ticks)
                 return np.array([step, *[0.0] * 6, width])
 
-        return loop.run(Moves(), seconds, self.log)
+        return loop.run(actor or Moves(), seconds, self.log)

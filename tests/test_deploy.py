@@ -32,8 +32,8 @@ from touchgoal.control.deployment.session import Session
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
+from touchgoal.episodes.episode_recorder import EpisodeRecorder
 from touchgoal.episodes.format.repair import validate
-from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.deploy import NOT_DONE, STOPPED
@@ -136,7 +136,7 @@ def test_a_longer_run_needs_more_room(tmp_path: Path, monkeypatch: pytest.Monkey
         with pytest.raises(SystemExit) as ended:
             run("deploy", cell, "--execute", "--yes", "--out", tmp_path / f"{seconds:g}")
         codes.append(ended.value.code)
-    assert "make room for 1.1 GB" in str(codes[0]) and codes[1] == NOT_DONE  # time is up
+    assert "make room for 2.6 GB" in str(codes[0]) and codes[1] == NOT_DONE  # time is up
 
 
 def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:
@@ -170,12 +170,10 @@ def test_without_a_simulator_the_operator_says_whether_it_is_done(
     def wanted() -> Request:
         return request_ if len(ticks) > 2 else ""
 
-    def record(frames: dict, task: str, meta: dict) -> int:
-        return EpisodeWriter(tmp_path, ft.CONTROL_HZ).append(Episode(frames, task, meta))
-
-    session = Session(cell, connection, safety, record, True, lambda _: actor, wanted, on_tick)
+    recorder = EpisodeRecorder(tmp_path / "episodes", ft.CONTROL_HZ)
+    session = Session(cell, connection, safety, recorder, True, lambda _: actor, wanted, on_tick)
     assert session.run().success is success
-    meta = EpisodeSet(tmp_path).meta(0)
+    meta = EpisodeSet(tmp_path / "episodes").meta(0)
     assert meta["outcome"] == outcome and meta.get("success") is success
 
 
@@ -196,6 +194,7 @@ class Turns:
         ("np.zeros(7)", "act gave an array of shape (7,); return 7 joint changes (rad)"),
         ("np.full(8, np.nan)", "return finite numbers"),
         ("1 / 0", "ZeroDivisionError: division by zero (own.py line 8)"),
+        ("observation['observation.state'].sort()", "read-only (own.py line 8)"),
     ],
 )
 def test_a_wrong_policy_of_ones_own_stops_the_arm_with_its_name(

@@ -8,7 +8,7 @@ import cv2
 import mujoco
 import numpy as np
 import pytest
-from fake_cell import SIM, FakeArm, FakeCamera, FakeCell, write_cell_file
+from fake_cell import SIM, FakeArm, FakeCamera, FakeCell, KeptTicks, write_cell_file
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
@@ -133,6 +133,6 @@ def test_exchanged_cameras_end_a_run_after_its_start_move(exchanged: bool, tmp_p
 
     config, safety = read_cell_file(write_cell_file(tmp_path, text)), ActionFilter(FR3, 20)
     no_operator = {"operator_request": lambda: "", "on_tick": lambda _: None}
-    session = Session(config, cell.connection(), safety, lambda *_: 0, True, actor, **no_operator)
+    session = Session(config, cell.connection(), safety, KeptTicks(), True, actor, **no_operator)
     ending = session.run().ending
     assert ending.stopped == exchanged and ("look exchanged" in ending.reason) == exchanged

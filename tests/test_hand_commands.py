@@ -117,6 +117,10 @@ SEQUENCES = {  # widths that are asked for, and the commands that they make
         [OPEN, *[0.03] * 20, 0.02, 0.02, 0.02, *[0.07] * 10],
         [("move", 0.03), ("grasp", 0.0), ("move", 0.07)],
     ),
+    "a move meets something when it is to open": (
+        [OPEN, *[0.03] * 10, *[OPEN] * 20],
+        [("move", 0.03), ("move", 0.08)],
+    ),
     "a grasp goes on": (
         [OPEN, *[0.0] * 20, *[0.01] * 5, *[0.03] * 5, *[OPEN] * 20],
         [("grasp", 0.0), ("move", 0.08)],

@@ -1,6 +1,8 @@
 """One object measures arrays, sets and runs; what is checked before any encoder is loaded."""
 
 import json
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -242,12 +244,43 @@ def test_cost_during_a_run_is_raw_without_normalizer(encoder: TouchEncoder) -> N
     tick = {FRONT: IMAGES[0], TACTILE_LEFT: TOUCH["left"][0], TACTILE_RIGHT: TOUCH["right"][0]}
     cost = OnlineCost(meter_of(encoder, None, IMAGES[9]))
     expected = Reward(IMAGES[9], towers=PaintTowers())(images=IMAGES).costs["image"][0]
-    assert cost.latest_cost(tick) == pytest.approx(expected, abs=1e-6)
+    cost.begin(tick)
+    assert cost.read().cost == pytest.approx(expected, abs=1e-6)
     cost.close()
     with pytest.raises(UserError, match="raw distances of several modalities"):
         meter_of(encoder, None, IMAGES[9], "soft")
     with pytest.raises(UserError, match="not known before the end"):
         meter_of(encoder, None, "last")
+
+
+class Rising(CostMeter):
+    """A meter of a cost that rises at the second measurement, after which it hangs until it may go on."""
+
+    def __init__(self) -> None:
+        self.costs, self.may_go_on = [0.1, 0.9], threading.Event()
+
+    def measure(self, observation: dict, first: object) -> float:
+        return self.costs.pop(0) if self.costs else self.may_go_on.wait() * 0.9
+
+
+def test_one_high_cost_and_a_meter_that_hangs_are_no_failed_run() -> None:
+    meter, tick = Rising(), {FRONT: IMAGES[0]}
+    cost = OnlineCost(meter, give_up=0.3)
+    cost.begin(tick)
+    assert cost.read().cost == 0.1
+    high = None
+    for _ in range(100):
+        cost.hand_over(tick)
+        high = cost.read() if cost.read().cost == 0.9 else high
+        time.sleep(0.002)
+    assert high is not None and cost.read() == high and not cost.failed
+    meter.may_go_on.set()
+    for _ in range(500):
+        cost.hand_over(tick)
+        cost.read()
+        time.sleep(0 if cost.failed else 0.01)
+    assert cost.failed and cost.read().stamp > high.stamp
+    cost.close()
 
 
 def meter_of(

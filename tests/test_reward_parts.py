@@ -293,6 +293,6 @@ def test_the_cost_rewards_an_environment() -> None:
 
 
 def test_a_run_whose_cost_has_risen_for_a_second_has_failed() -> None:
-    watch = FailureWatch(0.3, ticks=3)
+    watch = FailureWatch(0.3, n=3)
     falling, bump, lost = [0.9, 0.6, 0.4], [0.8, 0.8, 0.4], [0.75, 0.75, 0.75]
     assert [watch.update(c) for c in (*falling, *bump, *lost)] == [*[False] * 8, True]

@@ -1,8 +1,10 @@
 """Serial drivers against devices on pseudo-terminals: good lines, garbled ones, unplugged ones."""
 
+import errno
 import os
 import random
 import struct
+import termios
 import threading
 import tty
 from collections.abc import Iterator
@@ -212,6 +214,27 @@ def test_the_robotiq_bears_a_garbled_answer_and_says_faults(line: tuple[int, str
     with pytest.raises(DriverError, match="overcurrent"):
         gripper.command(0.05)
     os.close(device)
+    with pytest.raises(DriverError, match="gripper"):
+        until(lambda: gripper.read().width > 1)
+    gripper.close()
+
+
+def test_the_robotiqs_port_raises_driver_errors_alone_and_holds_up_no_command(
+    line: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device, port = line
+    Gripper2F85(device, active=True)
+    gripper = Robotiq(RobotiqConfig(port))
+    gripper.read()
+    with gripper._port_lock:  # as during an exchange
+        gripper.command(0.03)
+
+    def pulled() -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(gripper._port, "reset_input_buffer", pulled)
+    with pytest.raises(DriverError, match="its port failed .*check its USB cable"):
+        gripper.stop()
     with pytest.raises(DriverError, match="gripper"):
         until(lambda: gripper.read().width > 1)
     gripper.close()

@@ -35,7 +35,7 @@ def test_a_gripper_that_falls_silent_holds_then_stops_the_arm() -> None:
     cell.gripper.silent_from = 1.0
     ending = cell.run(lambda _: None, step=0.001)
     assert ending.stopped and "gripper age" in ending.reason
-    moved = np.diff([row[ft.STATE][0] for row in cell.log.rows])
+    moved = np.diff([row[ft.STATE][0] for row in cell.rows])
     assert (moved[:15] > 0).all() and (np.abs(moved[-8:]) < 1e-9).all()
 
 
@@ -56,8 +56,8 @@ def test_what_is_not_a_number_stops_arm_and_gripper_and_never_reaches_the_record
     ending = cell.run(at(10, set_(getattr(cell, device), **values)), step=0.001)
     assert ending.stopped and message in ending.reason and np.isfinite(ending.rest_seconds)
     assert cell.arm.stopped and cell.gripper.commands[-1] == "stop"
-    assert len(cell.log.rows) >= 10
-    assert all(np.isfinite(value).all() for row in cell.log.rows for value in row.values())
+    assert len(cell.rows) >= 10
+    assert all(np.isfinite(value).all() for row in cell.rows for value in row.values())
 
 
 def test_a_moment_without_numbers_is_bridged() -> None:
@@ -67,7 +67,7 @@ def test_a_moment_without_numbers_is_bridged() -> None:
         set_(cell.arm, velocity=np.full(7, NAN if tick == 10 else 0.0))()
 
     ending = cell.run(each, step=0.001, seconds=2.0)
-    assert not ending.stopped and len(cell.log.rows) > 30
+    assert not ending.stopped and len(cell.rows) > 30
 
 
 def test_what_presses_on_the_table_is_recorded_and_stops_the_arm() -> None:
@@ -77,7 +77,7 @@ def test_what_presses_on_the_table_is_recorded_and_stops_the_arm() -> None:
         cell.load_cell = FakeLoadCell(cell.clock, force=55.0)
         ending = cell.run(at(10, lambda c=cell, n=change: setattr(c.load_cell, "force", 55 + n)))
         assert ending.stopped and "load on the table 40" in ending.reason
-        assert [row[ft.LOAD].item() for row in cell.log.rows] == [55.0] * len(cell.log.rows)
+        assert [row[ft.LOAD].item() for row in cell.rows] == [55.0] * len(cell.rows)
 
 
 def test_a_policy_is_told_how_old_its_observation_is() -> None:
@@ -86,7 +86,7 @@ def test_a_policy_is_told_how_old_its_observation_is() -> None:
     cell.cameras[ft.FRONT] = camera
     ending = cell.run(at(10, lambda: setattr(camera, "late", 0.08)), step=0.001, seconds=1.0)
     assert not ending.stopped
-    ages = [row[ft.AGE].item() for row in cell.log.rows]
+    ages = [row[ft.AGE].item() for row in cell.rows]
     assert ages == pytest.approx([0.0] * 10 + [0.08] * (len(ages) - 10)) and len(ages) > 15
 
 
@@ -117,11 +117,11 @@ def test_a_dry_run_imagines_one_consistent_arm() -> None:
     ending = cell.run(lambda _: None, step=0.01, seconds=1.0, width=0.06, execute=False)
     assert not ending.stopped and not cell.gripper.commands
     kinematics = Kinematics(FR3.arm, FR3.tool.tcp_offset)
-    for row in cell.log.rows:
+    for row in cell.rows:
         position, _ = kinematics.forward(row[ft.STATE][:7].astype(float))
         np.testing.assert_allclose(row[ft.TCP_POSE][:3], position, atol=1e-5)
         assert not row[ft.WRENCH].any()
-    first, last = cell.log.rows[0], cell.log.rows[-1]
+    first, last = cell.rows[0], cell.rows[-1]
     assert np.linalg.norm(last[ft.TCP_POSE][:3] - first[ft.TCP_POSE][:3]) > 0.02
     assert last[ft.STATE][-1] == pytest.approx(0.06)
 
@@ -158,7 +158,7 @@ def hand_fault(
     monitor = HandMonitor(FR3.tool)
     touched = None if indentation is None else np.full(2, indentation)
     faults = (
-        monitor.update(reading(width, grasped), commanded, touched, 0.05 * tick)
+        monitor.update(reading(width, grasped), commanded, 0.05 * (tick - 1), touched, 0.05 * tick)
         for tick, (width, grasped) in enumerate(readings)
     )
     return next((fault for fault in faults if fault), "")

@@ -10,7 +10,7 @@ from blocked_packages import SIMULATOR, Blocker
 
 Blocker(*(BLOCKED := ("torch", *SIMULATOR)))
 
-from fake_cell import FakeCell, write_cell_file
+from fake_cell import FakeCell, KeptTicks, write_cell_file
 
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.deployment.actors import make_actor
@@ -53,7 +53,7 @@ def run(folder: Path, policy: str, seconds: float) -> tuple[Result, FakeCell]:
         return make_actor(cell, loaded, safety, None, loop.commanded)
 
     no_operator = {"operator_request": lambda: "", "on_tick": lambda _: None}
-    session = Session(cell, fake.connection(), safety, lambda *_: 0, True, actor, **no_operator)
+    session = Session(cell, fake.connection(), safety, KeptTicks(), True, actor, **no_operator)
     return session.run(), fake
 
 

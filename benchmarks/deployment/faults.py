@@ -36,9 +36,9 @@ from touchgoal.control.deployment.session import Session
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor, Planner
 from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.episodes.episode_recorder import EpisodeRecorder
 from touchgoal.episodes.format.repair import validate
-from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
@@ -95,6 +95,8 @@ CASES = (
     FaultCase("load cell garbled", "garble load_cell 1.0"),
     FaultCase("policy: not a number", policy="nan"),
     FaultCase("policy hangs", policy="hangs"),
+    FaultCase("policy raises", policy="raises"),
+    FaultCase("policy edits observation", policy="edits"),
     FaultCase("joint limit ahead", policy="outwards"),
     FaultCase("force ceiling met", "nudge 0 29 0 3"),
     FaultCase("contact reflex", "error cartesian_reflex"),
@@ -215,12 +217,10 @@ def _deploy(
     truth = connection.truth
     assert truth is not None
 
-    def record(frames: dict[str, np.ndarray], task: str, meta: dict[str, Any]) -> int:
-        return EpisodeWriter(episodes, ft.CONTROL_HZ).append(Episode(frames, task, meta))
-
     def session(make: Callable[[ControlLoop], Actor], seconds: float) -> Session:
         short = replace(cell, task=replace(cell.task, seconds=seconds))
-        return Session(short, connection, safety, record, True, make, lambda: "", lambda _: None)
+        recorder = EpisodeRecorder(episodes, ft.CONTROL_HZ)
+        return Session(short, connection, safety, recorder, True, make, lambda: "", lambda _: None)
 
     def expert(loop: ControlLoop) -> Actor:
         return make_actor(cell, None, safety, truth, loop.commanded)
@@ -267,10 +267,14 @@ class BrokenPolicy(Actor):
         step = np.zeros(n)
         joint = -1 if self._how == "outwards" else 0  # the wrist meets its limit before the box's
         step[joint] = 0.0 if self._how == "still" else 0.02
-        if self._how == "nan" and self._ticks > ft.CONTROL_HZ:
-            step[0] = np.nan
+        if self._how in ("nan", "raises", "edits") and self._ticks > ft.CONTROL_HZ:
             if self._ticks == ft.CONTROL_HZ + 1:
                 self._mark_broken()
+            if self._how == "raises":
+                raise KeyError("observation.image")
+            if self._how == "edits":
+                observation[ft.STATE] -= 1
+            step[0] = np.nan
         return np.append(step, width)
 
 

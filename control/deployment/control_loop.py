@@ -8,7 +8,8 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from traceback import extract_tb
 from typing import Literal
@@ -17,17 +18,24 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection, RealClock
-from touchgoal.control.deployment.hand import HandMonitor, HeldObject
+from touchgoal.control.deployment.hand import HandMonitor, HeldObject, require_empty_hand
 from touchgoal.control.deployment.observation import CellReading, ObservationReader
-from touchgoal.control.features import Observation
-from touchgoal.control.interfaces import STOPPED_ON_REQUEST, Actor, ArmReading, DriverError
+from touchgoal.control.features import read_only
+from touchgoal.control.interfaces import (
+    STOPPED_ON_REQUEST,
+    Actor,
+    ArmReading,
+    Cost,
+    CostReading,
+    DriverError,
+)
+from touchgoal.control.run_log import SLOW_ARM, RunLog, slow_arm
 from touchgoal.control.safety.action_filter import ActionFilter, Limit, Measurements, SafetyState
 from touchgoal.runtime.errors import UserError
 
 _REST_SPEED = 0.01  # rad/s
 _REST_TIMEOUT = 3.0  # s to wait for rest, by the loop's clock
 _REST_WALL_TIMEOUT = 10.0  # s of wall time to wait for rest
-SLOW_ARM = 0.95  # share of real time below which an arm's clock means a twin that cannot keep up
 
 ADVICE = {
     Limit.NOT_A_NUMBER: "the policy's output is broken: do not use this checkpoint",
@@ -90,39 +98,8 @@ _REQUESTED_ENDINGS: dict[Request, Ending] = {
     "not done": Ending("the operator says that the task is not done", done=False),
     "discard": Ending(DISCARDED),
     "success": Ending("the simulator says that the task is done", done=True),
-    "failed": Ending("the cost has risen for a second: the policy has failed", done=False),
+    "failed": Ending("the cost has risen and stays: the policy has failed", done=False),
 }
-
-
-@dataclass
-class RunLog:
-    """Record of a run."""
-
-    # observation and command of each tick, by key
-    rows: list[dict[str, np.ndarray]] = field(default_factory=list)
-    # lateness, answer_times: s by which each tick began late, and s that the actor took
-    lateness: list[float] = field(default_factory=list)
-    answer_times: list[float] = field(default_factory=list)
-    limit_counts: dict[str, int] = field(default_factory=dict)  # commands changed, by limit
-    # the loop's and the arm's clock at each tick, s
-    clocks: list[tuple[float, float]] = field(default_factory=list)
-
-    @property
-    def arm_pace(self) -> float:
-        """Pace of the arm's clock as a share of real time, in the median second; 1 if unknown.
-
-        Below 1 it is a twin on a machine that is too slow for it, which looks like an arm that does
-        not follow.
-        """
-        ticks = np.array(self.clocks)
-        if len(ticks) < 2 or ticks[-1, 0] - ticks[0, 0] < 1:
-            return 1.0
-        seconds = np.arange(ticks[0, 0], ticks[-1, 0] + 1e-9)
-        return float(np.median(np.diff(np.interp(seconds, *ticks.T))))
-
-    def frames(self) -> dict[str, np.ndarray]:
-        """Key -> (T, ...)."""
-        return {key: np.stack([row[key] for row in self.rows]) for key in self.rows[0]}
 
 
 @dataclass(frozen=True)
@@ -134,7 +111,7 @@ class TickStatus:
     reading: CellReading
     width: float
     late: float
-    cost: float | None
+    cost: CostReading | None
 
 
 class ControlLoop:
@@ -147,10 +124,12 @@ class ControlLoop:
         execute: bool,
         operator_request: Callable[[], Request],
         on_tick: Callable[[TickStatus], None],
-        cost: Callable[[Observation], float] | None = None,
+        cost: Cost | None = None,
         camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2],
     ) -> None:
-        """Begin with the arm at rest; UserError outside its limits, or for too small images.
+        """Begin with the arm at rest.
+
+        UserError outside its limits, for too small images, or if fingertips already hold something.
 
         Args:
             connection, safety: devices to read and command; their limits and the control rate.
@@ -162,9 +141,17 @@ class ControlLoop:
         """
         self._connection, self._safety, self._execute = connection, safety, execute
         self._operator_request, self._on_tick, self._cost = operator_request, on_tick, cost
-        self.reader = ObservationReader(connection, camera_size)
-        self.state = safety.start(connection.arm.read().q)
-        self.width = connection.gripper.read().width
+        try:
+            self.reader = ObservationReader(connection, camera_size)
+            self.state = safety.start(connection.arm.read().q)
+            gripper = connection.gripper.read()
+        except UserError:
+            raise
+        except Exception as error:  # of any driver; nothing has moved
+            raise DriverError(f"{type(error).__name__}: {error}") from error
+        if self.reader.has_fingertips:
+            require_empty_hand(gripper)
+        self.width = gripper.width
         self._held = HeldObject()
         self._hand = HandMonitor(safety.limits.tool)
 
@@ -180,17 +167,24 @@ class ControlLoop:
                 return self._loop(actor, seconds, log)
         except UserError as error:
             return self._arm_first(self.stop(str(error), "check what it names, then start again"))
-        except Exception as error:  # most likely the policy's error; stop the arm in any case
+        except (Exception, SystemExit) as error:  # most likely the policy's; stop in any case
             message, origin = " ".join(str(error).split()), extract_tb(error.__traceback__)[-1]
             where = f"{Path(origin.filename).name} line {origin.lineno}"
             return self.stop(
                 f"{type(error).__name__}: {message} ({where})", "the program or the policy failed"
             )
+        finally:
+            _done(actor.close)
 
     def _loop(self, actor: Actor, seconds: float, log: RunLog) -> Ending:
         clock = self._connection.clock
-        actor.start(self._read().observation)
-        begin = due = clock.now()
+        observation = read_only(self._read().observation)
+        if self._cost:
+            self._cost.begin(observation)
+        actor.start(observation)
+        if self._cost:
+            self._cost.read()  # waits for the first, so that no tick does
+        begin = due = self._sent_at = clock.now()
         first = True
         while True:
             late = clock.now() - due
@@ -210,7 +204,7 @@ class ControlLoop:
             clock.wait(due)
 
     def stop(self, reason: str, advice: str, release_to: float | None = None) -> Ending:
-        """Stop arm and gripper for good, and watch the arm come to rest.
+        """Stop arm and gripper for good, and watch the arm come to rest; no device makes it raise.
 
         `reason` and `advice` are for the operator. The gripper opens to `release_to` (m); None: it
         stays, and holds its object.
@@ -219,29 +213,33 @@ class ControlLoop:
             return Ending(reason, False, True, advice)
         arm, clock = self._connection.arm, self._connection.clock
         began, end = clock.now(), time.monotonic() + _REST_WALL_TIMEOUT
-        arm.stop()
-        with suppress(DriverError):  # a lost gripper must not keep the arm from being watched
-            self._connection.gripper.stop(release_to)
-        rest, last = np.inf, arm.read()
-        while clock.now() - began < _REST_TIMEOUT and time.monotonic() < end:
-            clock.wait(clock.now() + self._safety.dt / 5)
-            reading = arm.read()
-            if reading.time > last.time and _speed(last, reading) < _REST_SPEED:
-                rest = clock.now() - began
-                break
-            last = reading
+        told = _done(arm.stop)
+        _done(partial(self._connection.gripper.stop, release_to))
+        rest, last = np.inf, None
+        while rest == np.inf and clock.now() - began < _REST_TIMEOUT and time.monotonic() < end:
+            told = told or _done(arm.stop)
+            with suppress(Exception):  # an arm that cannot be read now may be read later
+                clock.wait(clock.now() + self._safety.dt / 5)
+                reading = arm.read()
+                if last and reading.time > last.time and _speed(last, reading) < _REST_SPEED:
+                    rest = clock.now() - began
+                last = reading
+        if not told:
+            advice = f"the arm did not take the stop: press the emergency stop; then {advice}"
         return Ending(reason, False, True, advice, rest)
 
     def _arm_first(self, ending: Ending) -> Ending:
         """Name the arm's own fault first, if it has one: it often makes other devices fail, too."""
-        fault = self._connection.arm.read().fault
+        fault = ""
+        with suppress(Exception):
+            fault = self._connection.arm.read().fault
         if not fault or fault.startswith(STOPPED_ON_REQUEST) or fault in ending.reason:
             return ending
         return replace(ending, reason=f"arm: {fault}; also: {ending.reason}")
 
     def _tick(self, actor: Actor, log: RunLog, seconds: float, late: float) -> Ending | None:
         reading = self._read()
-        log.clocks.append((self._connection.clock.now(), reading.arm.time))
+        log.clocks.extend((self._connection.clock.now(), reading.arm.time))
         if not self._execute:
             reading = self._as_commanded(reading)
         if ending := self._device_fault(reading):
@@ -251,25 +249,30 @@ class ControlLoop:
                 return self.stop(STOPPED_BY_OPERATOR, "start deploy again when you are ready")
             return _REQUESTED_ENDINGS[request]
         asked = time.perf_counter()
-        action = np.asarray(actor.act(reading.observation), np.float64)
+        observation = read_only(reading.observation)
+        action = np.asarray(actor.act(observation), np.float64)
         log.answer_times.append(time.perf_counter() - asked)
         before, measured = self.state, self._measurements(reading, actor.action_age)
         self.state = self._safety.filter_action(before, action[:-1], measured)
         self.width = self._safety.filter_width(self.state, float(action[-1]), self.width)
         for limit in self.state.active_limits:
             log.limit_counts[limit] = log.limit_counts.get(limit, 0) + 1
-        cost = self._cost(reading.observation) if self._cost else None
+        cost = None
+        if self._cost:
+            self._cost.hand_over(observation)
+            cost = self._cost.read()
         self._on_tick(TickStatus(seconds, self.state, reading, self.width, late, cost))
         if self.state.fault is not None:
             return self._stop_for_fault(reading, log.arm_pace)
         if self._execute:
             self._connection.arm.command(self.state.q)
             self._connection.gripper.command(self.width)
+            self._sent_at = self._connection.clock.now()
         done = np.append(self.state.q - before.q, self.width).astype(np.float32)
-        row = {**reading.observation, ft.ACTION: done}
+        tick = {**observation, ft.ACTION: done}
         if cost is not None:
-            row[ft.COST] = np.array([cost], np.float32)
-        log.rows.append(row)
+            tick[ft.COST] = np.array([cost.cost], np.float32)
+        log.add(tick)
         return None
 
     def _device_fault(self, reading: CellReading) -> Ending | None:
@@ -283,7 +286,8 @@ class ControlLoop:
             return None
         indentation = reading.indentation if self.reader.has_fingertips else None
         now = self._connection.clock.now()
-        if wrong := self._hand.update(reading.gripper, self.width, indentation, now):
+        sent = self.width, self._sent_at
+        if wrong := self._hand.update(reading.gripper, *sent, indentation, now):
             return self.stop(wrong, _HAND_ADVICE)
         return None
 
@@ -339,12 +343,12 @@ class ControlLoop:
         return replace(reading, arm=arm, observation={**reading.observation, **imagined})
 
 
-def slow_arm(pace: float) -> str:
-    """Return advice on an arm whose clock runs at this share of real time."""
-    return (
-        f"the arm's clock goes at {pace:.2f} of real time: this twin cannot keep up, and "
-        "everything comes late in its time; free the machine, or start it with --lock-step"
-    )
+def _done(call: Callable[[], None]) -> bool:
+    """Return whether a call to a device went through; no fault may keep the rest of a stop undone."""
+    with suppress(Exception):
+        call()
+        return True
+    return False
 
 
 def _speed(before: ArmReading, now: ArmReading) -> float:

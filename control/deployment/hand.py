@@ -5,6 +5,7 @@ from jaxtyping import Float
 
 from touchgoal.control.interfaces import GripperReading
 from touchgoal.control.motion.tool import Tool
+from touchgoal.runtime.errors import UserError
 
 _CONFIRMING = 2  # readings in a row that must agree before an object counts as held
 _SLIPPED = 0.003  # m that the fingers close further when the object is gone
@@ -15,6 +16,15 @@ _CLOSING_ERROR = 0.003  # m above the commanded width at which a closed hand may
 # fingertips mounted does not open as far as its model.
 _OPENING_ERROR = 0.25
 _REACTION_TIME = 0.5  # s from a command to its answer, besides the motion
+
+
+def require_empty_hand(gripper: GripperReading) -> None:
+    """Raise UserError if the hand holds something before fingertips are taken as untouched."""
+    if gripper.grasped:
+        raise UserError(
+            f"the hand holds something, {1e3 * gripper.width:.0f} mm wide, so its fingertips are not "
+            "untouched: open the hand first (touchgoal arm open) and take it out"
+        )
 
 
 class HeldObject:
@@ -49,7 +59,8 @@ class HeldObject:
 class HandMonitor:
     """Finds a hand that does not move as commanded, or reports an object that no fingertip touches.
 
-    After a command the width must change, or an object be grasped, within stroke / speed + 0.5 s.
+    Once a command is sent the width must change, or an object be grasped, within stroke / speed +
+    0.5 s.
     """
 
     def __init__(self, tool: Tool) -> None:
@@ -57,32 +68,34 @@ class HandMonitor:
         self._timeout = opened / tool.speed + _REACTION_TIME
         self._opening_error = _OPENING_ERROR * opened
         self._width = -np.inf  # m, when it last moved
-        self._still_since = self._touched_at = -np.inf  # s
+        self._still_since = self._untouched_since = np.inf  # s
 
     def update(
         self,
         gripper: GripperReading,
         commanded: float,
+        sent_at: float,
         indentation: Float[np.ndarray, "2"] | None,
         time: float,
     ) -> str:
         """Return what is wrong at a time (s); empty if nothing.
 
-        `commanded` (m) is the width before the reading; `indentation` of both gels in m, None
-        without fingertips.
+        `commanded` (m) is the width before the reading, sent at a time (s); `indentation` of both
+        gels in m, None without fingertips.
         """
-        if abs(gripper.width - self._width) > _MOVES:
-            self._width, self._still_since = gripper.width, time
-        if self._follows(gripper, commanded):
-            self._still_since = time
-        if not gripper.grasped or indentation is None or indentation.any():
-            self._touched_at = time
+        moves = abs(gripper.width - self._width) > _MOVES
+        if moves:
+            self._width = gripper.width
+        still = not moves and not self._follows(gripper, commanded)
+        self._still_since = min(self._still_since, sent_at) if still else np.inf
+        untouched = gripper.grasped and indentation is not None and not indentation.any()
+        self._untouched_since = min(self._untouched_since, sent_at) if untouched else np.inf
         if (still := time - self._still_since) > self._timeout:
             return (
                 f"the hand does not follow: commanded {1e3 * commanded:.0f} mm, is "
                 f"{1e3 * gripper.width:.0f} mm for {still:.1f} s"
             )
-        if (untouched := time - self._touched_at) > self._timeout:
+        if (untouched := time - self._untouched_since) > self._timeout:
             return (
                 f"the hand reports an object {1e3 * gripper.width:.0f} mm wide, but neither fingertip "
                 f"has touched anything for {untouched:.1f} s"

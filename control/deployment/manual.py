@@ -13,12 +13,12 @@ from touchgoal.control.deployment.control_loop import (
     ControlLoop,
     Ending,
     Request,
-    RunLog,
     TickStatus,
 )
 from touchgoal.control.deployment.scripted import PlannedMove, ScriptedActor, start_move
 from touchgoal.control.interfaces import Joints
 from touchgoal.control.motion.arm_models import ArmModel
+from touchgoal.control.run_log import RunLog
 from touchgoal.control.safety.action_filter import ActionFilter
 
 _TIMEOUT = 60.0  # s for a move

@@ -126,7 +126,7 @@ class ObservationReader:
         for key, camera in self._connection.cameras.items():
             try:
                 problem = camera.problem
-            except DriverError as error:
+            except Exception as error:  # of any driver
                 problem = str(error)
             if problem:
                 found.append(f"{key.removeprefix(ft.IMAGE_PREFIX)}: {problem}")

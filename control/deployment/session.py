@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -14,21 +14,19 @@ from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import (
     DISCARDED,
     PLAN_ENDED,
-    SLOW_ARM,
     ControlLoop,
     Ending,
     Request,
-    RunLog,
     TickStatus,
-    slow_arm,
 )
 from touchgoal.control.deployment.scripted import start_move
 from touchgoal.control.features import Observation
-from touchgoal.control.interfaces import Actor, DriverError
+from touchgoal.control.interfaces import Actor, Cost
+from touchgoal.control.run_log import SLOW_ARM, RunLog, slow_arm
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.sensors.exchanged import Picture, cameras_exchanged
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.control.tactile.light_gain import LightWatch, light_advice
+from touchgoal.control.tactile.light_gain import light_advice
 from touchgoal.runtime.errors import UserError
 
 _START_TOLERANCE = 0.02  # rad from the start pose after the start move
@@ -36,12 +34,24 @@ _CLOSE_TO_START = 0.1  # rad; nearer than that no start move is made
 _START_TIMEOUT = 60.0  # s for the start move
 _SETTLE_TIME = 2.0  # s that a simulator may take to see that the task is done
 _ASK_INTERVAL = 0.2  # s between questions to a twin
-_LIGHT_TICKS = 10  # from one look at the fingertips' light to the next
 _VERDICTS = {True: "done", False: "not done", None: "unknown whether it is done"}
 
-RecordEpisode = Callable[[dict[str, np.ndarray], str, dict[str, Any]], int]
-"""Record frames (key -> (T, ...)), instruction and facts as an episode; return its index."""
 Truth = Callable[[], dict[str, Any]]  # return what a simulator knows of its scene
+
+
+@runtime_checkable
+class Recorder(Protocol):
+    """Takes one episode tick by tick."""
+
+    def add(self, tick: Observation) -> None:
+        """Take a tick; neither waits nor raises: `save` says what failed."""
+
+    def save(self, task: str, meta: dict[str, Any]) -> int:
+        """Save the ticks as an episode, return its index; OSError, UserError or MemoryError."""
+        ...
+
+    def close(self) -> None:
+        """Drop what was not saved."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +59,7 @@ class Result:
     """Outcome of a deployment."""
 
     ending: Ending  # how the run ended
-    log: RunLog  # its record
+    log: RunLog  # its figures
     success: bool | None  # whether the task is done, by the simulator or the ending; None: unknown
     # of the task in [0, 1], by the simulator; for a task of one's own the share of the distance to
     # its goal that is gone since the start; None without either
@@ -66,13 +76,13 @@ class Session:
     cell: CellConfig
     connection: CellConnection
     safety: ActionFilter
-    record: RecordEpisode  # saves the episode
+    recorder: Recorder
     execute: bool  # False: a dry run, which records nothing
     make_actor: Callable[[ControlLoop], Actor]  # makes the actor when the arm is at its start
     # operator_request, on_tick, cost, camera_size: see ControlLoop
     operator_request: Callable[[], Request]
     on_tick: Callable[[TickStatus], None]
-    cost: Callable[[Observation], float] | None = None
+    cost: Cost | None = None
     camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2]
 
     def run(self) -> Result:
@@ -80,10 +90,15 @@ class Session:
 
         UserError or DriverError if it cannot begin; nothing has moved then.
         """
+        with closing(self.recorder):
+            return self._run()
+
+    def _run(self) -> Result:
         # Scripts end by themselves; for other actors only a simulator knows when the task is done.
         scripted = self.cell.task.policy == "expert"
         truth = None if scripted else self._truth
-        watch, log = _SuccessWatch(truth, self.cell.time_waits), RunLog()
+        watch = _SuccessWatch(truth, self.cell.time_waits)
+        log = RunLog(self.recorder.add) if self.execute else RunLog()
         loop = ControlLoop(
             self.connection,
             self.safety,
@@ -96,8 +111,7 @@ class Session:
         try:
             ending = self._move_to_start(loop)
             if ending is None:
-                with closing(self.make_actor(loop)) as actor:
-                    ending = loop.run(actor, self.cell.task.seconds, log)
+                ending = loop.run(self.make_actor(loop), self.cell.task.seconds, log)
         finally:
             watch.close()
         picked = self.execute and scripted and ending.reason == PLAN_ENDED
@@ -105,9 +119,9 @@ class Session:
             ending = Ending(f"{PLAN_ENDED}, but the hand holds nothing", done=False)
         success = self._success(ending)
         episode, recording_error = None, ""
-        if self.execute and log.rows and ending.reason != DISCARDED:
+        if self.execute and log.ticks and ending.reason != DISCARDED:
             try:
-                episode = self._record_episode(log, ending, success)
+                episode = self._save_episode(ending, success)
             except (OSError, UserError, MemoryError) as error:
                 recording_error = (
                     f"this episode could not be saved ({error}); those before it are whole"
@@ -139,7 +153,7 @@ class Session:
                 f"the start pose was missed by {off:.3f} rad", "look for what holds the arm back"
             )
         after = self._camera_images()
-        pairs = [(before[key], after[key]) for key in before]
+        pairs = [(before[key], after[key]) for key in before if key in after]
         if len(pairs) == len(ft.CAMERAS) and cameras_exchanged(*pairs):
             return loop.stop(
                 "the front and the wrist camera look exchanged: what is called front moves with the arm",
@@ -148,9 +162,12 @@ class Session:
         return None
 
     def _camera_images(self) -> dict[str, Picture]:
-        """Return the newest image of front and wrist camera, in this order, of those present."""
-        cameras = self.connection.cameras
-        return {key: cameras[key].read().image for key in ft.CAMERAS if key in cameras}
+        """Return the newest image of front and wrist camera, in this order, of those that work."""
+        images = {}
+        for key, camera in self.connection.cameras.items():
+            with suppress(Exception):  # the loop's next tick names it
+                images[key] = camera.read().image
+        return {key: images[key] for key in ft.CAMERAS if key in images}
 
     def _success(self, ending: Ending) -> bool | None:
         """Return the outcome; a run that was stopped is no success, whatever the task looks like."""
@@ -178,11 +195,11 @@ class Session:
     def _held_width(self) -> float | None:
         try:
             reading = self.connection.gripper.read()
-        except DriverError:  # the ending says so
+        except Exception:  # of any driver; the ending says so
             return None
         return reading.width if reading.grasped else None
 
-    def _record_episode(self, log: RunLog, ending: Ending, success: bool | None) -> int:
+    def _save_episode(self, ending: Ending, success: bool | None) -> int:
         cell = self.cell
         outcome = {True: "success", False: "failure", None: "unknown"}[success]
         meta: dict[str, Any] = {
@@ -195,25 +212,20 @@ class Session:
         }
         if success is not None:
             meta["success"] = success
-        return self.record(log.frames(), cell.task.instruction or cell.task.name, meta)
+        return self.recorder.save(cell.task.instruction or cell.task.name, meta)
 
 
 def distance_gone(log: RunLog) -> float | None:
     """Return the share of the first tick's cost that is gone at the end; None without a cost."""
-    costs = [float(row[ft.COST][0]) for row in log.rows if ft.COST in row]
-    if not costs or costs[0] <= 0:
-        return None
-    return float(np.clip(1 - costs[-1] / costs[0], 0.0, 1.0))
+    first, last = (
+        float(tick[ft.COST][0]) if ft.COST in tick else 0.0 for tick in (log.first, log.newest)
+    )
+    return float(np.clip(1 - last / first, 0.0, 1.0)) if first > 0 else None
 
 
 def metrics(result: Result) -> dict[str, Any]:
     """Return the numbers of a run, for metrics.json."""
     ending, log = result.ending, result.log
-    light = LightWatch()
-    for row in log.rows[::_LIGHT_TICKS]:
-        light.update(row)
-    forces = [np.linalg.norm(row[ft.WRENCH][:3]) for row in log.rows]
-    ages = [row[ft.AGE].item() for row in log.rows]
     return {
         "reason": ending.reason,
         "stopped": ending.stopped,
@@ -224,14 +236,14 @@ def metrics(result: Result) -> dict[str, Any]:
         "held_width": result.held_width,
         "episode": result.episode,
         "recording_error": result.recording_error,
-        "ticks": len(log.rows),
+        "ticks": log.ticks,
         "late_p99_ms": 1e3 * float(np.percentile(log.lateness or [0.0], 99)),
         "answered_p95_ms": 1e3 * float(np.percentile(log.answer_times or [0.0], 95)),
-        "observation_age_p95_ms": 1e3 * float(np.percentile(ages or [0.0], 95)),
-        "force_max_newtons": float(max(forces, default=0.0)),
+        "observation_age_p95_ms": 1e3 * float(np.percentile(log.ages or [0.0], 95)),
+        "force_max_newtons": log.max_force,
         "clamped": log.limit_counts,
         "arm_pace": log.arm_pace,
-        "light_change": light.change,
+        "light_change": log.light.change,
     }
 
 
@@ -240,7 +252,7 @@ def report(result: Result, numbers: dict[str, Any], episodes: str) -> str:
     ending, log = result.ending, result.log
     clamped = ", ".join(f"{name} {n}" for name, n in log.limit_counts.items()) or "never"
     lines = [
-        f"{len(log.rows)} ticks of the control loop; 99 % began at most {numbers['late_p99_ms']:.1f} ms "
+        f"{log.ticks} ticks of the control loop; 99 % began at most {numbers['late_p99_ms']:.1f} ms "
         f"late, 95 % were answered within {numbers['answered_p95_ms']:.1f} ms; 95 % of the observations "
         f"were at most {numbers['observation_age_p95_ms']:.0f} ms old",
         f"largest force on the hand: {numbers['force_max_newtons']:.1f} N; commands limited: {clamped}",
@@ -271,6 +283,8 @@ class _SuccessWatch:
         self._truth = truth
         threaded = truth is not None and not time_waits
         self._thread = LatestValue("simulator", self._ask_now_and_then) if threaded else None
+        if self._thread:
+            self._thread.read()  # waits for the first answer, so that no tick does
 
     def request(self) -> Request:
         return self._thread.read() if self._thread else self._ask()

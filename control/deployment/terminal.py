@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any
@@ -79,7 +80,10 @@ class Terminal:
         limits = ", ".join(state.active_limits)
         mode = f"{state.mode} ({limits})" if state.mode is Mode.MOVE and limits else state.mode
         force = float(np.linalg.norm(reading.arm.wrench[:3]))
-        cost = "" if status.cost is None else f"cost {status.cost:5.2f}"
+        cost = ""
+        if status.cost is not None:
+            old = time.monotonic() - status.cost.stamp
+            cost = f"cost {status.cost.cost:5.2f}" + (f", {old:.0f} s old" if old > 1 else "")
         line = (
             f"{status.seconds:6.1f} s  {mode:<24}  {force:5.1f} N  "
             f"gel {1e3 * reading.indentation.max():3.1f} mm  gripper {1e3 * status.width:3.0f} mm  "

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from touchgoal.control import features as ft
-from touchgoal.control.features import Observation
+from touchgoal.control.features import Observation, read_only
 from touchgoal.control.interfaces import Planner, Policy
 from touchgoal.control.policy_server.policy import ServedPolicy
 from touchgoal.runtime.errors import UserError
@@ -51,7 +51,7 @@ class UserPolicy(Planner):
 
     def act(self, observation: Observation) -> Float32[np.ndarray, " a"]:
         """Return the next action; UserError if not finite or not of the robot's shape."""
-        answer = self._policy.act(dict(observation))
+        answer = self._policy.act(read_only(observation))
         self.done = bool(getattr(self._policy, "done", False))
         wanted = f"{self._n_joints} joint changes (rad) and the gripper's width (m)"
         try:

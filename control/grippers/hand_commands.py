@@ -3,7 +3,7 @@
 The hand takes one slow command at a time (0.8 s at most), while a policy asks for a width every
 tick. When a command has ended, the newest width is sent, unless the target is still changing faster
 than the hand can move. Only closing all the way is sent as a grasp, which ends at an object of any
-width; an inward move that meets an object is followed by a grasp.
+width; an inward move that meets an object is followed by a grasp, unless the hand is to open by then.
 """
 
 from dataclasses import dataclass
@@ -33,6 +33,7 @@ class HandCommands:
         """Begin with the hand at rest at that width (m)."""
         self._sent = self._last_target = width
         self._moves_inwards = False  # whether the last command was an inward move
+        self._met = False  # whether that move has met an object
         self._passing = 0  # looks in a row with a changing target
 
     def next(
@@ -45,15 +46,17 @@ class HandCommands:
         passes = self._passes(target)
         if last == "runs":
             return None
-        met, self._moves_inwards = self._moves_inwards and last == "stopped short", False
-        if met:
-            return HandCommand(self._sent, grasp=True)
+        self._met |= self._moves_inwards and last == "stopped short"
+        self._moves_inwards = False
+        if self._met and target < width:
+            self._met = False
+            return HandCommand(target, grasp=True)
         if passes or abs(target - self._sent) <= CLOSED_WIDTH:
             return None
         self._sent = target
         if grasped and target < width:
             return None  # the grasp goes on: it holds by force
-        self._moves_inwards = CLOSED_WIDTH < target < width
+        self._moves_inwards, self._met = CLOSED_WIDTH < target < width, False
         return HandCommand(target, grasp=target <= CLOSED_WIDTH)
 
     def _passes(self, target: float) -> bool:

@@ -57,13 +57,14 @@ class RobotiqConfig:
 
 
 class Robotiq:
-    """Gripper over a 2F-85; a thread talks to it, commands never wait."""
+    """Gripper over a 2F-85; a thread talks to it, commands never wait for the port."""
 
     def __init__(self, config: RobotiqConfig) -> None:
         self.config = config
         self._port = open_port(config.port, 115200, timeout=0.1)
         self._modbus = minimalmodbus.Instrument(self._port, SLAVE)
-        self._lock = threading.Lock()
+        # `_lock` is of `_wanted` and `_stopped`, and is held for no exchange.
+        self._port_lock, self._lock = threading.Lock(), threading.Lock()
         self._wanted: int | None = None
         self._stopped, self._misses = False, 0
         try:
@@ -91,7 +92,8 @@ class Robotiq:
         with self._lock:
             self._stopped = True
             self._wanted = None if release_to is None else self._position(release_to)
-            if self._wanted is None:
+        if release_to is None:
+            with self._port_lock:
                 self._write(bytes([ACTIVATE, 0, 0, 0, 0, 0]))
 
     def close(self) -> None:
@@ -135,7 +137,7 @@ class Robotiq:
     def _take(self) -> GripperReading | None:
         time.sleep(_PERIOD)
         try:
-            with self._lock:
+            with self._port_lock:
                 self._send()
                 status = self._status()
         except DriverError:
@@ -154,11 +156,12 @@ class Robotiq:
 
     def _send(self) -> None:
         """Repeat the command: after a second of silence the gripper reports a fault."""
-        if self._wanted is None:
+        wanted = self._wanted
+        if wanted is None:
             return
         speed = to_count(self.config.speed, SPEEDS)
         force = to_count(self.config.force, FORCES)
-        self._write(bytes([ACTIVATE | GO, 0, 0, self._wanted, speed, force]))
+        self._write(bytes([ACTIVATE | GO, 0, 0, wanted, speed, force]))
 
 
 def to_count(value: float, span: tuple[float, float]) -> int:
@@ -181,3 +184,5 @@ def _exchange(call: Callable[[], list[int] | None]) -> list[int]:
         raise DriverError(f"it refuses: {error}") from error
     except minimalmodbus.ModbusException as error:
         raise DriverError("a garbled answer: check the cable") from error
+    except Exception as error:  # of the port: termios.error is no OSError
+        raise DriverError(f"its port failed ({error}): check its USB cable") from error

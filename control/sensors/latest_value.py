@@ -7,6 +7,7 @@ from typing import Generic, TypeVar
 from touchgoal.control.interfaces import DriverError
 
 T = TypeVar("T")
+_CLOSE_TIMEOUT = 15.0  # s; the slowest poll, of a lock-step twin's pictures, takes 10
 
 
 class LatestValue(Generic[T]):
@@ -34,9 +35,9 @@ class LatestValue(Generic[T]):
         return self._value
 
     def close(self) -> None:
-        """End the thread; afterwards the device may be released."""
+        """End the thread, so that the device may be released; one that hangs is left behind."""
         self._stop.set()
-        self._thread.join()
+        self._thread.join(_CLOSE_TIMEOUT)
 
     def _run(self) -> None:
         while not self._stop.is_set():

@@ -7,10 +7,13 @@ The Parquet footer of a data file carries a `Description` of its episode as JSON
 its checksum, so that everything under meta/ can be rebuilt from the data files alone.
 """
 
-import io
 import json
 import zlib
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
+from mmap import mmap
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -31,6 +34,7 @@ from touchgoal.episodes.schema import (
     is_camera,
     is_image,
 )
+from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import decode_picture
 
@@ -63,27 +67,28 @@ class Description:
 
 @dataclass(frozen=True, eq=False)
 class EncodedEpisode:
-    """An episode ready to be appended; it pickles."""
+    """An episode ready to be appended; it pickles, unless it was encoded with a folder."""
 
     description: Description  # everything but the frames
-    # key -> PNG bytes per frame for touch, array (T, d) for numbers
-    columns: dict[str, Shaped[np.ndarray, "n d"] | list[bytes]]
-    videos: dict[str, bytes]  # camera key -> MP4 bytes
+    # key -> PNG bytes per frame for touch, or the images themselves; array (T, d) for numbers
+    columns: dict[str, Shaped[np.ndarray, "n ..."] | list[bytes]]
+    videos: dict[str, bytes | mmap]  # camera key -> MP4 bytes
 
 
-def encode(episode: Episode, fps: int) -> EncodedEpisode:
+def encode(episode: Episode, fps: int, folder: Path | None = None) -> EncodedEpisode:
     """Compress an episode recorded at `fps` frames per second.
 
-    UserError: the episode does not pass `Episode.check`.
+    With a `folder` for its videos, and frames mapped from files, an episode of any length takes the
+    same memory. UserError: the episode does not pass `Episode.check`.
     """
     episode.check()
     columns, videos, stats = {}, {}, {}
     for key in (key for key in FEATURES if key in episode.frames):
         values = episode.frames[key]
         if is_camera(key):
-            videos[key] = encode_video(values, fps)
+            videos[key] = encode_video(values, fps, folder)
         elif is_image(key):
-            columns[key] = [encode_png(image) for image in values]
+            columns[key] = values if folder else [encode_png(image) for image in values]
         else:
             columns[key] = values
         compute = statistics.image_statistics if is_image(key) else statistics.array_statistics
@@ -134,28 +139,40 @@ def index_columns(
     return {key: columns[key].astype(dtype) for key, dtype in INDEX_DTYPES.items()}
 
 
-def data_file(encoded: EncodedEpisode, indices: dict[str, Shaped[np.ndarray, " n"]]) -> bytes:
-    """Return the Parquet file of an episode's numbers and touch, with its description in the footer."""
-    arrays = {key: _to_arrow(key, column) for key, column in encoded.columns.items()}
-    arrays |= {key: pa.array(column) for key, column in indices.items()}
-    return write_table(pa.table(arrays), encoded.description)
+def write_data_file(
+    path: Path, encoded: EncodedEpisode, indices: dict[str, Shaped[np.ndarray, " n"]]
+) -> None:
+    """Write the Parquet file of an episode's numbers and touch, with its description in the footer."""
+
+    def tables() -> Iterator[pa.Table]:
+        for begin in range(0, encoded.description.length, FRAMES_PER_ROW_GROUP):
+            rows = slice(begin, begin + FRAMES_PER_ROW_GROUP)
+            arrays = {key: _to_arrow(key, c[rows], begin) for key, c in encoded.columns.items()}
+            yield pa.table(arrays | {key: pa.array(c[rows]) for key, c in indices.items()})
+
+    with atomic_write(path) as unfinished:
+        write_tables(unfinished, tables(), encoded.description)
 
 
-def write_table(table: pa.Table, description: Description) -> bytes:
-    """Return a Parquet file of frames with a checksum on every page and on the description."""
+def write_tables(path: Path, tables: Iterable[pa.Table], description: Description) -> None:
+    """Write tables of frames as one Parquet file, with a checksum on every page and the description.
+
+    Each but the last has a multiple of `FRAMES_PER_ROW_GROUP` frames.
+    """
     text = json.dumps(vars(description)).encode()
     footer = {_FOOTER_KEY: text, _CHECKSUM_KEY: str(zlib.crc32(text)).encode()}
-    file = io.BytesIO()
-    pq.write_table(
-        table.replace_schema_metadata(footer),
-        file,
-        row_group_size=FRAMES_PER_ROW_GROUP,
+    marked = (table.replace_schema_metadata(footer) for table in tables)
+    first = next(marked)
+    with pq.ParquetWriter(
+        path,
+        first.schema,
         compression="none",  # PNG is compressed; numbers are a thousandth of the bytes
         use_dictionary=False,
         write_statistics=False,  # they would repeat whole images as a column's min and max
         write_page_checksum=True,
-    )
-    return file.getvalue()
+    ) as file:
+        for table in chain([first], marked):
+            file.write_table(table, FRAMES_PER_ROW_GROUP)
 
 
 def has_description(file: pq.ParquetFile) -> bool:
@@ -185,15 +202,17 @@ def read_description(file: pq.ParquetFile) -> Description:
     return description
 
 
-def _to_arrow(key: str, column: Shaped[np.ndarray, "n d"] | list[bytes]) -> pa.Array:
-    if isinstance(column, list):
-        names = [f"frame-{i:06d}.png" for i in range(len(column))]
-        parts = [pa.array(column, pa.binary()), pa.array(names)]
+def _to_arrow(key: str, column: Shaped[np.ndarray, "n ..."] | list[bytes], first: int) -> pa.Array:
+    if is_image(key):
+        names = [f"frame-{first + i:06d}.png" for i in range(len(column))]
+        pngs = [x if isinstance(x, bytes) else encode_png(x) for x in column]
+        parts = [pa.array(pngs, pa.binary()), pa.array(names)]
         return pa.StructArray.from_arrays(parts, names=["bytes", "path"])
-    flat = pa.array(np.ascontiguousarray(column).reshape(-1))
+    values = np.ascontiguousarray(column)
+    flat = pa.array(values.reshape(-1))
     if FEATURES[key].shape == (1,):
         return flat
-    return pa.FixedSizeListArray.from_arrays(flat, column.shape[1])
+    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
 def read_columns(

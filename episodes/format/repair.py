@@ -12,10 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from touchgoal.episodes.format import set_files
-from touchgoal.episodes.format.encoding import Description, read_description, write_table
+from touchgoal.episodes.format.encoding import Description, read_description, write_tables
 from touchgoal.episodes.format.foreign import foreign_data_file, foreign_file, refusal
 from touchgoal.episodes.format.metadata import SetMetadata
-from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.folder_lock import FolderLock
 from touchgoal.runtime.progress import track
@@ -189,7 +189,8 @@ def _rewrite_index_columns(
 ) -> None:
     for key, values in indices.items():
         table = table.set_column(table.column_names.index(key), key, pa.array(values))
-    write_file(path, write_table(table, description))
+    with atomic_write(path) as unfinished:
+        write_tables(unfinished, [table], description)
 
 
 def _move_to_repaired(root: Path, name: str) -> str:

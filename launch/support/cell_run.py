@@ -1,13 +1,11 @@
-"""Steps that every command with a moving arm shares: connect, check, record."""
+"""Steps that every command with a moving arm shares: connect and check."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from touchgoal.runtime.errors import require_all_ok
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from touchgoal.control.cell.config import CellConfig
     from touchgoal.control.cell.connection import CellConnection
     from touchgoal.control.safety.action_filter import ActionFilter
@@ -49,14 +47,3 @@ def check_cell(cell: "CellConfig", connection: "CellConnection", episodes: Path)
     print("\n".join(map(str, results)), flush=True)
     require_all_ok(results)
     return safety
-
-
-def record_episode(
-    episodes: Path, frames: "dict[str, np.ndarray]", task: str, meta: dict[str, Any]
-) -> int:
-    """Add an episode to the folder and return its index; see `session.RecordEpisode`."""
-    from touchgoal.control import features as ft
-    from touchgoal.episodes.schema import Episode
-    from touchgoal.episodes.store import EpisodeWriter
-
-    return EpisodeWriter(episodes, ft.CONTROL_HZ).append(Episode(frames, task, meta))
