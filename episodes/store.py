@@ -115,18 +115,14 @@ class EpisodeWriter:
             self._metadata.check_fits(self._root, shapes, task)
 
     def append(self, episode: Episode | EncodedEpisode) -> int:
-        """Add an episode; when this returns, it is on disk.
-
-        Returns:
-            The episode's index in the set.
+        """Add an episode and return its index in the set; it is on disk by then.
 
         Raises:
             UserError: The episode is unsound or does not fit the set, which stays as it was; or
                 another process writes to the set.
         """
-        encoded = (
-            encode(episode, self._fps, self._root) if isinstance(episode, Episode) else episode
-        )
+        whole = isinstance(episode, Episode)
+        encoded = encode(episode, self._fps, self._root) if whole else episode
         description = encoded.description
         current = self._metadata or SetMetadata(self._fps, description.features)
         file_number = current.next_file_number
