@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control.arms.driver_process import error_line
 from touchgoal.control.cell.connection import CellConnection, RealClock
 from touchgoal.control.deployment.hand import HandMonitor, HeldObject, require_empty_hand
 from touchgoal.control.deployment.observation import CellReading, ObservationReader
@@ -148,7 +149,7 @@ class ControlLoop:
         except UserError:
             raise
         except Exception as error:  # of any driver; nothing has moved
-            raise DriverError(f"{type(error).__name__}: {error}") from error
+            raise DriverError(error_line(error)) from error
         if self.reader.has_fingertips:
             require_empty_hand(gripper)
         self.width = gripper.width

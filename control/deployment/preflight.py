@@ -10,6 +10,7 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY, UR_RTDE, ClientLibrary
+from touchgoal.control.arms.driver_process import error_line
 from touchgoal.control.arrays import Picture
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
@@ -100,7 +101,7 @@ def _run_check(what: str, check: Callable[[], str]) -> CheckResult:
     try:
         return CheckResult(what, True, check())
     except Exception as error:  # of any driver, or a disk that takes no file
-        return CheckResult(what, False, "", str(error))
+        return CheckResult(what, False, "", error_line(error))
 
 
 def check_client(cell: CellConfig) -> str:
