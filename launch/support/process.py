@@ -24,19 +24,24 @@ _WRITE_ERRORS = {  # errno -> advice
 def run_command(program: str, arguments: list[str], action: Callable[..., None]) -> None:
     """Call `action(*arguments)`, a command's name and options, as `program`.
 
-    Exit status: 1 after a user's mistake or a failed write, in one line on stderr (2 if tyro finds
+    With `--traceback` among them a user's mistake shows its traceback, as a bug does. Exit status: 1 after a user's mistake or a failed write, in one line on stderr (2 if tyro finds
     it), 130 after Ctrl-C and 143 after SIGTERM.
     """
-    prog = f"{program} {arguments[0]}"
+    prog, whole = f"{program} {arguments[0]}", "--traceback" in arguments
+    arguments = [argument for argument in arguments if argument != "--traceback"]
     with _recorded_as([program, *arguments]), terminable():
-        _report_errors(prog, action, arguments)
+        _report_errors(prog, action, arguments, whole)
 
 
-def _report_errors(prog: str, action: Callable[..., None], arguments: list[str]) -> None:
+def _report_errors(
+    prog: str, action: Callable[..., None], arguments: list[str], whole: bool
+) -> None:
     try:
         _require_working_directory()
         action(*arguments)
     except UserError as error:
+        if whole:
+            raise
         sys.exit(f"{prog}: {error}")
     except OSError as error:
         if error.errno not in _WRITE_ERRORS:
