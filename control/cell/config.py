@@ -233,6 +233,12 @@ class CellConfig:
     """Whether the arm is a twin that waits for its client; the control loop then follows its clock."""
 
     @property
+    def moves_nothing_real(self) -> bool:
+        """Whether the arm is simulated: in this program, or by a twin at the arm's own address."""
+        host = self.task.twin.rpartition("@")[2].rpartition(":")[0]
+        return self.arm == "sim" or bool(host) and host == self.address
+
+    @property
     def time_waits(self) -> bool:
         """Whether the arm's time stands still while this program works."""
         return self.arm == "sim" or self.lock_step

@@ -1,9 +1,11 @@
 """Steps that every command with a moving arm shares: connect, check, record."""
 
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from touchgoal.runtime.errors import require_all_ok
+from touchgoal.runtime.errors import CheckResult, UserError, require_all_ok
 
 if TYPE_CHECKING:
     import numpy as np
@@ -14,19 +16,31 @@ if TYPE_CHECKING:
 
 
 def connect(cell: "CellConfig", new_episode: bool = True) -> "CellConnection":
-    """Connect to the cell; for a new episode a twin first puts its scene back."""
+    """Connect to the cell, of a twin as the only one; for a new episode it first puts its scene back.
+
+    UserError or DriverError if a device does not open, after a line for each of them.
+    """
     from touchgoal.control import features as ft
     from touchgoal.control.cell.connection import connect_cell
-    from touchgoal.control.cell.twin_client import reset_scene
+    from touchgoal.control.cell.twin_client import lease_twin, reset_scene
 
     if cell.arm == "sim":
         from touchgoal.sim_envs.cell.in_process import simulate_cell
 
         return simulate_cell(cell, ft.CONTROL_HZ)
-    if cell.task.twin and new_episode:
-        reset_scene(cell.task.twin, cell.task.seed)
-        print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
-    return connect_cell(cell, ft.CONTROL_HZ, new_episode)
+    with ExitStack() as undo:
+        lease = undo.enter_context(lease_twin(cell.task.twin)) if cell.task.twin else None
+        if lease and new_episode:
+            reset_scene(cell.task.twin, cell.task.seed)
+            print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
+        rows: list[CheckResult] = []
+        try:
+            connection = connect_cell(cell, ft.CONTROL_HZ, new_episode, rows.append)
+        except UserError:
+            print("\n".join(map(str, rows)), flush=True)
+            raise
+        undo.pop_all()
+    return replace(connection, lease=lease)
 
 
 def check_cell(cell: "CellConfig", connection: "CellConnection", episodes: Path) -> "ActionFilter":
