@@ -6,11 +6,14 @@ import os
 import select
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import Terminated, terminable
+from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.run_folder import release_runs
 
 _WRITE_ERRORS = {  # errno -> advice
@@ -40,6 +43,7 @@ def _report_errors(
         _require_working_directory()
         action(*arguments)
     except UserError as error:
+        _tell_torchrun(f"{prog}: {error}")
         if whole:
             raise
         sys.exit(f"{prog}: {error}")
@@ -55,6 +59,12 @@ def _report_errors(
         sys.exit(128 + stopped_by)
     finally:
         release_runs()
+
+
+def _tell_torchrun(message: str) -> None:
+    """Leave the message where torchrun, which prints a traceback of its own, ends with it."""
+    if path := os.environ.get("TORCHELASTIC_ERROR_FILE"):
+        write_json(Path(path), {"message": message, "timestamp": int(time.time())})
 
 
 def _require_working_directory() -> None:

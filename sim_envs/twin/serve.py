@@ -1,5 +1,8 @@
 """The twin: one loop of all wire services and the physics, 1 ms at a time."""
 
+import errno
+import os
+import socket
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -68,6 +71,7 @@ class Twin:
         self._lock_step: LockStep | None = None
         self._next_step_at = time.monotonic()
         self.stopped = False  # set it to end `run`
+        self.parent: int | None = None  # process with which `run` ends, too
         self.pace = Pace()
         self._services: list[Service] = []
         with ExitStack() as undo:
@@ -75,15 +79,19 @@ class Twin:
             try:
                 self.cell_config = self._open(config)  # content of the cell file
             except OSError as error:
+                advice = (
+                    "if another twin is there, end it or choose another address: --host 127.0.0.2"
+                )
+                if error.errno == errno.EADDRNOTAVAIL or isinstance(error, socket.gaierror):
+                    advice = "--host must be an address of this computer (ip address lists them)"
                 raise UserError(
-                    f"cannot serve at {config.host} ({error.strerror}); if another twin is there, "
-                    "end it or choose another address: --host 127.0.0.2"
+                    f"cannot serve at {config.host} ({error.strerror}); {advice}"
                 ) from error
             undo.pop_all()
 
     def run(self) -> None:
-        """Serve until `stopped`."""
-        while not self.stopped:
+        """Serve until `stopped`, or until the parent has ended."""
+        while not self.stopped and self.parent in (None, os.getppid()):
             self.step()
 
     def step(self) -> None:
