@@ -2,7 +2,7 @@
 
 import os
 import shlex
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -67,7 +67,7 @@ def main(config: Config) -> None:
     cell = "sim" if config.task == "pick-place" else "sim_maze"
     if changed := _changed_options(config):
         print(
-            f"next, on the wire of a real arm: touchgoal twin --task {config.task} {changed} --out runs/twin"
+            f"next, the cell to it: touchgoal twin --task {config.task} {changed} --out runs/twin"
         )
         cell = "runs/twin/cell.json"
     command = f"touchgoal deploy {cell} --execute --policy {shlex.quote(config.policy)}"
@@ -82,10 +82,6 @@ def _changed_options(config: Config) -> str:
     """Return the options of the task that differ from its own, as typed; nested ones stay away."""
     from touchgoal.policies.by_name import typed_option
 
-    default = ENVS[config.task]
-    names = [
-        field.name for field in fields(default) if not is_dataclass(getattr(default, field.name))
-    ]
-    given = {name: getattr(config.env, name) for name in names}
-    changed = {name: value for name, value in given.items() if value != getattr(default, name)}
-    return " ".join(typed_option(*option) for option in changed.items())
+    given, default = vars(config.env), vars(ENVS[config.task])
+    changed = {name: value for name, value in given.items() if value != default[name]}
+    return " ".join(typed_option(*one) for one in changed.items() if not is_dataclass(one[1]))

@@ -13,15 +13,10 @@ Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 """Between 0 and 1, both included."""
 
 
-def _countable(number: int) -> int:
-    if number > 2**53:  # beyond that numpy, torch and tqdm fail, each in its own way
-        raise ValueError(f"must be less than 10^16, not {number}")
-    return number
-
-
-Count = Annotated[int, Field(ge=1), AfterValidator(_countable)]
-CountOrNone = Annotated[int, Field(ge=0), AfterValidator(_countable)]  # count that may be 0
-Seed = Annotated[int, Field(ge=0), AfterValidator(_countable)]
+LARGEST = 2**53  # beyond it numpy, torch and tqdm fail, each in its own way
+Count = Annotated[int, Field(ge=1, le=LARGEST)]
+CountOrNone = Annotated[int, Field(ge=0, le=LARGEST)]  # count that may be 0
+Seed = Annotated[int, Field(ge=0, le=LARGEST)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 Repository = Annotated[str, Field(pattern=r"^\w[\w.-]*/\w[\w.-]*$")]
 """Repository on the Hugging Face Hub, as owner/name."""

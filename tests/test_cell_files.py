@@ -134,8 +134,14 @@ TIPS = 'fingertips = { sensor = "digit", left = "simulated", right = "*" }'
             SIM.replace("seed = 3", 'normalizer = "no"'),
             "task.normalizer does nothing without task.re",
         ),
-        (REAL.replace("172.16.0.2", "172.16.0.300"), "address 172.16.0.300 is none: give four num"),
-        (REAL.replace("[640, 480]", "[480, 640]"), "did you mean [640, 480]?"),
+        (
+            REAL.replace("172.16.0.2", "172.16.0.300"),
+            "address '172.16.0.300' does not appear to be",
+        ),
+        (
+            REAL.replace("[640, 480]", "[480, 640]"),
+            "front.size must be width, then height: did you mean [640,",
+        ),
         (
             REAL.replace("force = 30.0", "force = 29.9"),
             "gripper.force must lie between 30 and 70 N",

@@ -76,7 +76,9 @@ def test_a_bad_value_is_named_as_typed_and_a_mistyped_name_guessed(
 
 def test_a_mistake_is_one_line_and_with_traceback_all_of_it() -> None:
     huge = ["run-policy", "--episodes", "9" * 20]
-    with pytest.raises(SystemExit, match=r"--episodes must be less than 10\^16, not 9999.*$"):
+    with pytest.raises(
+        SystemExit, match="--episodes must be less than or equal to [0-9]*, not 9999"
+    ):
         main(huge)
     with pytest.raises(UserError, match="less than"):
         main([*huge, "--traceback"])

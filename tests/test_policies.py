@@ -139,7 +139,7 @@ class Own:
             "Own.env_config: PickPlaceConfig:",
         ),
         ("import nonesuch", "own.py:6: ModuleNotFoundError: No module named 'nonesuch'"),
-        ("def (", "own.py:6: SyntaxError: invalid syntax"),
+        ("def (", "own.py: SyntaxError: invalid syntax (own.py, line 6)"),
     ],
 )
 def test_a_mistake_in_ones_own_policy_is_one_line(more: str, message: str, tmp_path: Path) -> None:

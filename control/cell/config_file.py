@@ -61,7 +61,7 @@ def first_mistake(error: ValidationError, kind: type) -> str:
         return f"{name} must have {first['ctx']['max_length']} values, not {value!r}: {meaning}"
     if problem == "missing":
         return f"{name} is missing: {meaning}"
-    rule = first["msg"].replace("Input should", "must")
+    rule = first["msg"].replace("Input should", "must").removeprefix("Value error, ")
     if problem == "dataclass_type":
         rule = "must be a section with keys of its own"
     return f"{name} {rule}, not {value!r}: {meaning}"

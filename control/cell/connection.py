@@ -127,16 +127,11 @@ class CellConnection:
                     stack.callback(device.close)
 
 
-def connect_cell(
-    cell: CellConfig,
-    hz: float,
-    new_episode: bool = True,
-    report: Callable[[CheckResult], object] = lambda row: None,
-) -> CellConnection:
+def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellConnection:
     """Connect to everything in a cell with a real arm or a twin; commands will come at `hz`.
 
     A lock-step twin begins the episode of `task.seed`, or goes on with its own if not `new_episode`.
-    `report` gets a row for each device. UserError names all that do not open; the others are released.
+    UserError names all devices that do not open, after a row for each; the others are released.
     """
     robot, rows = cell_limits(cell), list[CheckResult]()
     with ExitStack() as undo:
@@ -148,7 +143,6 @@ def connect_cell(
             except UserError as error:
                 device = None
                 rows.append(CheckResult(name, False, "", str(error)))
-            report(rows[-1])
             return device
 
         cameras: dict[str, Camera] = {
@@ -160,7 +154,9 @@ def connect_cell(
             load_cell = opened("load cell", partial(SerialLoadCell, cell.load_cell))
         gripper = opened("gripper", partial(_gripper, cell))
         arm = opened("arm", partial(connect_arm, cell, hz))
-        require_all_ok(rows)
+        if not all(row.ok for row in rows):
+            print("\n".join(map(str, rows)), flush=True)
+            require_all_ok(rows)
         clock: Clock = RealClock()
         if cell.lock_step and isinstance(gripper, FrankaHand):
             clock = LockStepClock(cell.task.twin, arm, gripper, cameras, load_cell)

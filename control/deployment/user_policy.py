@@ -106,13 +106,11 @@ def _their_mistakes_named(name: str, keys: Iterable[str] = ()) -> Iterator[None]
         where = name
         frames = [(f.f_code, line) for f, line in walk_tb(error.__traceback__)]
         theirs = [f for f in frames if not f[0].co_filename.startswith(_NOT_THEIRS)]
-        if isinstance(error, SyntaxError) and error.filename:
-            where = f"{Path(error.filename).name}:{error.lineno}"
-        elif theirs:
+        if theirs:
             code, line = [f for f in theirs if f[0].co_filename == theirs[0][0].co_filename][-1]
             method = "" if code.co_name == "<module>" else f" in {code.co_qualname}"
             where = f"{Path(code.co_filename).name}:{line}{method}"
-        what = getattr(error, "msg", "") or " ".join(str(error).split())
+        what = " ".join(str(error).split())
         if isinstance(error, KeyError) and keys:
             what += f" (the observation has: {', '.join(keys)})"
         kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from touchgoal.runtime.errors import CheckResult, UserError, require_all_ok
+from touchgoal.runtime.errors import require_all_ok
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,10 +16,7 @@ if TYPE_CHECKING:
 
 
 def connect(cell: "CellConfig", new_episode: bool = True) -> "CellConnection":
-    """Connect to the cell, of a twin as the only one; for a new episode it first puts its scene back.
-
-    UserError or DriverError if a device does not open, after a line for each of them.
-    """
+    """Connect to the cell, a twin as the only one; for a new episode it first puts its scene back."""
     from touchgoal.control import features as ft
     from touchgoal.control.cell.connection import connect_cell
     from touchgoal.control.cell.twin_client import lease_twin, reset_scene
@@ -33,12 +30,7 @@ def connect(cell: "CellConfig", new_episode: bool = True) -> "CellConnection":
         if lease and new_episode:
             reset_scene(cell.task.twin, cell.task.seed)
             print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
-        rows: list[CheckResult] = []
-        try:
-            connection = connect_cell(cell, ft.CONTROL_HZ, new_episode, rows.append)
-        except UserError:
-            print("\n".join(map(str, rows)), flush=True)
-            raise
+        connection = connect_cell(cell, ft.CONTROL_HZ, new_episode)
         undo.pop_all()
     return replace(connection, lease=lease)
 

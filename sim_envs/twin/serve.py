@@ -1,8 +1,6 @@
 """The twin: one loop of all wire services and the physics, 1 ms at a time."""
 
-import errno
 import os
-import socket
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -79,13 +77,9 @@ class Twin:
             try:
                 self.cell_config = self._open(config)  # content of the cell file
             except OSError as error:
-                advice = (
-                    "if another twin is there, end it or choose another address: --host 127.0.0.2"
-                )
-                if error.errno == errno.EADDRNOTAVAIL or isinstance(error, socket.gaierror):
-                    advice = "--host must be an address of this computer (ip address lists them)"
                 raise UserError(
-                    f"cannot serve at {config.host} ({error.strerror}); {advice}"
+                    f"cannot serve at {config.host} ({error.strerror}): give an address of this "
+                    "computer at which no other twin is, such as --host 127.0.0.2"
                 ) from error
             undo.pop_all()
 
