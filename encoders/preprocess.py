@@ -8,7 +8,7 @@ from jaxtyping import Float32, UInt8
 
 from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.encoders.backbones.sparsh_input import SparshPreprocessor
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, unknown_name
 
 _ASPECT_TOLERANCE = 0.02  # a GelSight Mini's own 3280 x 2464 differs from 4:3 by 0.2 %
 
@@ -109,7 +109,7 @@ def preprocessor_for(sensor: str, version: int = 1) -> TactilePreprocessor:
     Version 1 gives 120 x 160 px of a sensor of 4:3, version 3 240 x 320, version 4 192 x 256.
     """
     if sensor not in PREPROCESSORS:
-        raise UserError(f"unknown sensor '{sensor}': choose from {', '.join(PREPROCESSORS)}")
+        raise unknown_name("sensor", sensor, PREPROCESSORS)
     if version not in _FACTORS:
         raise UserError(f"this version of touchgoal has no preprocessor {sensor}/v{version}")
     plain = PREPROCESSORS[sensor]

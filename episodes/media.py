@@ -19,6 +19,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
+from touchgoal.episodes.format.other_formats import refuse_other_format
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
@@ -28,7 +29,7 @@ KEY_FRAME_INTERVAL = 2  # frames, so that one frame is found by decoding at most
 _SEEKABLE = {"g": str(KEY_FRAME_INTERVAL), "bf": "0", "preset": "veryfast"}
 _DECODED_AT_ONCE = 64  # frames
 PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
-VIDEOS = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"}
+VIDEOS = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".gif"}
 """Endings of image and of video files that a folder is searched for."""
 
 
@@ -174,6 +175,9 @@ def open_clip(path: Path) -> Clip:
         return Clip(path, len(_image_files(path)), next(_folder_frames(path)).shape[:2], None)
     if not path.exists():
         raise UserError(f"{path} does not exist: give a video file or a folder of images")
+    refuse_other_format(path)
+    if next(_video_frames(path), None) is None:  # broken ones are refused before any work
+        raise UserError(f"{path} holds no frame: record it again")
     with _readable(path), av.open(str(path), "r") as container:
         if not container.streams.video:
             raise UserError(f"{path} holds no video stream: give a video file")
@@ -225,6 +229,8 @@ def _image_files(folder: Path) -> list[Path]:
             f"{folder} holds data/ but no meta/info.json; if it is a set of episodes, run: "
             f"touchgoal repair --fix {folder}"
         )
+    for path in () if paths else sorted(folder.iterdir()):
+        refuse_other_format(path)
     if not paths:
         raise UserError(f"{folder} holds no image ({', '.join(sorted(PICTURES))})")
     return in_natural_order(paths)

@@ -43,6 +43,7 @@ def usage() -> str:
     lines = [f"  {name:<22}{meaning}" for name, meaning in COMMANDS.items()]
     return (
         "usage: touchgoal COMMAND [options]\n       touchgoal COMMAND --help\n"
+        "       touchgoal COMMAND [options] --traceback    the whole traceback of a mistake\n"
         "       touchgoal --version\n\ncommands:\n" + "\n".join(lines)
     )
 
@@ -91,8 +92,9 @@ def _unknown(name: str) -> str:
     families = {command.split("-")[0] for command in COMMANDS}  # such as train, of train-policy
     close = get_close_matches(name, [*COMMANDS, *families], 1, cutoff=0.7)
     meant = [command for command in COMMANDS if close and command.startswith(close[0])]
-    guess = f"; did you mean {' or '.join(meant)}?" if meant else ""
-    return f"touchgoal: there is no command {name!r}{guess}\n\n{usage()}"
+    if meant:
+        return f"touchgoal: there is no command {name!r}; did you mean {' or '.join(meant)}?"
+    return f"touchgoal: there is no command {name!r}\n\n{usage()}"
 
 
 if __name__ == "__main__":

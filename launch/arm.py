@@ -70,14 +70,13 @@ def _move(move: str, cell: "CellConfig") -> None:
 
     import numpy as np
 
-    from touchgoal.control import features as ft
-    from touchgoal.control.cell.connection import connect_cell
     from touchgoal.control.deployment.control_loop import PLAN_ENDED
     from touchgoal.control.deployment.manual import ManualControl, home_pose
     from touchgoal.control.deployment.terminal import HELP, Terminal
+    from touchgoal.launch.support.cell_run import connect
 
     terminal = Terminal()
-    with closing(connect_cell(cell, ft.CONTROL_HZ, new_episode=False)) as connection:
+    with closing(connect(cell, new_episode=False)) as connection:
         with terminal.watching():
             print(f"MOVING: {HELP}", flush=True)
             control = ManualControl(cell, connection, terminal.operator_request, terminal.show_tick)

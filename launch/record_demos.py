@@ -76,7 +76,6 @@ def main(config: Config) -> None:
     cell = read_cell_file(file, config.device, config.sim, config.seed, config.task)
     if config.device != "scripted" and (sys.stdin is None or not sys.stdin.isatty()):
         raise UserError("nobody is there to lead the arm: run it in a terminal")
-    simulated = cell.arm == "sim" or bool(cell.task.twin)
     check_client(cell)
     if not config.yes:
         confirm(cell)
@@ -97,9 +96,9 @@ def main(config: Config) -> None:
         say(report(result, metrics(result), str(out / "episodes")))
         if result.success:
             _save_goal_picture(result, out / "goal.png")
-        if ending.stopped and (not simulated or ending.reason == STOPPED_BY_OPERATOR):
+        if ending.stopped and (not cell.moves_nothing_real or ending.reason == STOPPED_BY_OPERATOR):
             break
-        if simulated:
+        if cell.moves_nothing_real:
             cell = replace(cell, task=replace(cell.task, seed=cell.task.seed + 1))
     write_json(out / "metrics.json", {"episodes": numbers})
     done = sum(row["success"] is True for row in numbers)

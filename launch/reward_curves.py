@@ -97,19 +97,22 @@ def main(config: Config) -> None:
     )
     with_touch = config.towers is None or config.encoder is not None
     source = open_source(config.source, config.camera, config.index, with_touch, config.fps, keys)
-    if source.summary:
-        print(source.summary)
+    notices = [source.summary] if source.summary else []
     rewards = reward.prepare_source(source)
     specs = [spec for one in rewards.values() for spec in one.goals.values()]
     if not config.goal and any(isinstance(spec, Bank) for spec in specs):
-        print("failures are among the episodes: the goal is the nearest end of other successes")
+        notices.append(
+            "failures are among the episodes: the goal is the nearest end of other successes"
+        )
     elif OwnFrame() in specs and any(t.meta.get("success") is False for t in source.trajectories):
-        print("failures are among the trajectories; with goal last they end at cost 0, too")
+        notices.append(
+            "failures are among the trajectories; with goal last they end at cost 0, too"
+        )
     if config.audit and any(isinstance(spec, OwnFrame) for spec in specs):
         raise UserError("--audit needs goals from other trajectories: --goal bank:SET, for example")
     first = rewards[source.trajectories[0].name]
-    print(first.note)
     out = open_run(config.out, "reward-curves", config)
+    print("\n".join([*notices, first.note]))
     measurement = Measurement(source.trajectories, rewards, out, config.plots)
     embed = partial(embed_here, embedder=first.embedder)
     if config.ray is not None:

@@ -2,7 +2,7 @@
 
 import os
 import shlex
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -65,7 +65,23 @@ def main(config: Config) -> None:
     if config.task not in get_args(SimulatedTask):
         return
     cell = "sim" if config.task == "pick-place" else "sim_maze"
+    if changed := _changed_options(config):
+        print(
+            f"next, the cell to it: touchgoal twin --task {config.task} {changed} --out runs/twin"
+        )
+        cell = "runs/twin/cell.json"
     command = f"touchgoal deploy {cell} --execute --policy {shlex.quote(config.policy)}"
     if config.target and EPISODE_OBJECT not in config.target:
         command += f" --target {shlex.quote(config.target)}"
-    print(f"next, in the control loop of a real arm: {command}")
+    print(
+        f"{'meanwhile' if changed else 'next'}, in the loop that also drives a real arm: {command}"
+    )
+
+
+def _changed_options(config: Config) -> str:
+    """Return the options of the task that differ from its own, as typed; nested ones stay away."""
+    from touchgoal.policies.by_name import typed_option
+
+    given, default = vars(config.env), vars(ENVS[config.task])
+    changed = {name: value for name, value in given.items() if value != default[name]}
+    return " ".join(typed_option(*one) for one in changed.items() if not is_dataclass(one[1]))

@@ -1,10 +1,12 @@
 """Serve the simulated cell over the robot's and the sensors' own wire protocols.
 
 Any libfranka or RTDE client, any MJPEG reader and any serial client can drive it. It runs until
-Ctrl-C; a table and `cell.json` list every address.
+Ctrl-C, or until the program that started it ends, unless that is a terminal or nohup; a table and
+`cell.json` list every address.
 """
 
 import ipaddress
+import os
 import signal
 import sys
 from pathlib import Path
@@ -25,6 +27,7 @@ from touchgoal.sim_envs.config import (
 if TYPE_CHECKING:
     from touchgoal.control.cell.config import CellConfig
 
+_PARENT = os.getppid()  # as the command begins: loading takes seconds
 ENVS: dict[SimulatedTask, TaskConfig] = {
     "pick-place": PickPlaceConfig(camera_size=STREAM_SIZE),
     "bead-maze": BeadMazeConfig(
@@ -74,6 +77,9 @@ def main(config: Config) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
+    detached = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN  # by nohup
+    if not detached and not any(map(os.isatty, range(3))):
+        twin.parent = _PARENT
     cell_file = out / "cell.json"
     write_json(cell_file, cell_table(twin.cell_config))
     if warning := open_to_network(config.host):
@@ -122,7 +128,7 @@ def _table(cell: "CellConfig") -> str:
 
 def _pace_lines(numbers: dict[str, float]) -> list[str]:
     if not numbers["seconds"]:
-        return [""]
+        return ["no client drove the arm for a whole second: no pace to report", ""]
     return [
         f"{numbers['seconds']} s with a client that drives the arm: simulated over wall time "
         f"{numbers['pace_median']:.2f} in the median second, {numbers['pace_slowest']:.2f} in the slowest",

@@ -1,5 +1,6 @@
 """The policy that a command names: `expert`, `follower`, `shipped`, a folder, a user's class or a server."""
 
+import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -39,9 +40,9 @@ def prepare_policy(
         given, runs = getattr(task, name), getattr(needed, name)
         unread = name == "camera_size" and not needed.cameras
         if given != getattr(default, name) and (given != runs or unread):
-            instead = "reads no camera" if unread else f"runs with {_option(name, runs)}"
+            instead = "reads no camera" if unread else f"runs with {typed_option(name, runs)}"
             raise UserError(
-                f"{_option(name, given)}: the policy {policy} {instead}; leave the option out"
+                f"{typed_option(name, given)}: the policy {policy} {instead}; leave the option out"
             )
     return make, needed
 
@@ -88,10 +89,10 @@ def _warn_without_target(policy: SavedPolicy, task: TaskConfig) -> None:
         )
 
 
-def _option(name: str, value: object) -> str:
+def typed_option(name: str, value: object) -> str:
     """Return an option of the environment as it is typed."""
     name = name.replace("_", "-")
     if isinstance(value, bool):
         return f"--env.{name}" if value else f"--env.no-{name}"
     words = map(str, value) if isinstance(value, tuple) else [str(value)]
-    return " ".join([f"--env.{name}", *words])
+    return shlex.join([f"--env.{name}", *words])

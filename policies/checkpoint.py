@@ -1,7 +1,6 @@
 """Policies on disk."""
 
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_pose_estimator
 from touchgoal.policies.sight.frozen_images import ImageInputConfig
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, unknown_name
 
 TOUCH, ESTIMATOR = "touch", "estimator"  # folders beside a policy's weights
 EPISODE_OBJECT = "{object}"  # in a target: the object that the simulated episode asks for
@@ -162,12 +161,10 @@ def find_policy(name_or_path: str | Path, task: str = "") -> Path:
     if Path(name).is_dir():
         raise UserError(f"no policy in {name}: train one with touchgoal train-policy")
     names = POLICIES if task else folders
-    close = get_close_matches(name, names, 1)
-    guess = f"did you mean {close[0]}? " if close else ""
     others = ", a class of your own as module:Class or file.py:Class, or a server as ws://host:port"
     raise UserError(
-        f"there is no policy {name!r}: {guess}choose from {', '.join(names)}, or name a folder that "
-        f"train-policy or pull made{others if task else ''}"
+        f"{unknown_name('policy', name, names)}, or name a folder that train-policy or pull made"
+        f"{others if task else ''}"
     )
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import gymnasium as gym
 
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, unknown_name
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.for_rl import ForRL
 from touchgoal.sim_envs.fragile_carry import FragileCarry
@@ -70,7 +70,7 @@ def make(
             reward cannot be measured here.
     """
     if task not in _BY_NAME:
-        raise UserError(f"unknown task {task!r}; choose from: {', '.join(_BY_NAME)}")
+        raise unknown_name("task", task, _BY_NAME)
     env: gym.Env = _BY_NAME[task](**options)
     if reward is not None:
         from touchgoal.rewards.reward_wrapper import RewardWrapper

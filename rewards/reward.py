@@ -242,7 +242,10 @@ class Reward:
         """Return the touch encoder, and the folder that may hold a normalizer."""
         if not inputs.sides:
             if self._encoder is not None:
-                raise UserError(f"{inputs.name} has no touch: leave the encoder out")
+                raise UserError(
+                    f"{inputs.name} has no touch: leave the encoder out, or name the video of a "
+                    f"fingertip {Path(inputs.name).stem}_tactile_left.mp4"
+                )
             return None, pretrained.DEFAULT_ENCODER  # whose normalizer knows images, too
         if inputs.sensor not in self._encoders:
             encoder, folder = self._encoder, None

@@ -1,7 +1,8 @@
 """Exception for a user's mistake, and results of checks with their remedies."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 _MARKS = {True: "ok", False: "MISSING", None: "-"}
@@ -38,6 +39,14 @@ def require_all_ok(results: Sequence[CheckResult]) -> None:
     broken = [f for f in results if f.ok is False]
     if broken:
         raise UserError("; ".join(f"{f.name}: {f.remedy or f.detail}" for f in broken))
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
+    """Return the error for a name that does not exist: the nearest one, and all that do."""
+    known = list(known)
+    close = get_close_matches(name, known, 1)
+    guess = f"did you mean {close[0]}? Else " if close else ""
+    return UserError(f"unknown {kind} {name!r}: {guess}choose from {', '.join(known)}")
 
 
 def install_extra(extra: str) -> str:

@@ -11,9 +11,12 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 """Between 0 and 1, both included."""
-Count = Annotated[int, Field(ge=1)]
-CountOrNone = Annotated[int, Field(ge=0)]  # count that may be 0
-Seed = Annotated[int, Field(ge=0)]
+
+
+LARGEST = 2**53  # beyond it numpy, torch and tqdm fail, each in its own way
+Count = Annotated[int, Field(ge=1, le=LARGEST)]
+CountOrNone = Annotated[int, Field(ge=0, le=LARGEST)]  # count that may be 0
+Seed = Annotated[int, Field(ge=0, le=LARGEST)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 Repository = Annotated[str, Field(pattern=r"^\w[\w.-]*/\w[\w.-]*$")]
 """Repository on the Hugging Face Hub, as owner/name."""

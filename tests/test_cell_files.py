@@ -25,6 +25,7 @@ from touchgoal.launch.deploy import load_policy
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig
+from touchgoal.sim_envs.twin.cell_task import env_config_of
 
 REAL = (EXAMPLES / "fr3_two_minis.toml").read_text()
 
@@ -96,6 +97,17 @@ def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
         read_cell_file(path)
 
 
+def test_a_misspelt_object_is_named_by_its_key(tmp_path: Path) -> None:
+    wrong = SIM.replace("wooden", "wodden")
+    with pytest.raises(
+        UserError, match="^task.objects: unknown object 'wodden_block': did you mean"
+    ):
+        env_config_of(read_cell_file(write_cell_file(tmp_path, wrong)))
+
+
+TIPS = 'fingertips = { sensor = "digit", left = "simulated", right = "*" }'
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -108,7 +120,32 @@ def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
         (SIM.replace("policy =", "polcy ="), "task.polcy is unknown: did you mean policy?"),
         (SIM.replace("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),
         (SIM + "safety = { force = nan }", "safety.force must be a finite number, not nan: Ext"),
-        (SIM + 'fingertips = { sensor = "digt", left = "", right = "" }', "fingertips.sensor: dig"),
+        (
+            SIM + 'fingertips = { sensor = "digt", left = "a", right = "b" }',
+            "unknown sensor or folde",
+        ),
+        (
+            SIM + TIPS.replace("*", "simulatd"),
+            "fingertips.right is 'simulatd': did you mean 'simul",
+        ),
+        (SIM + TIPS.replace("*", ""), "fingertips.right is empty: give a value or leave it out"),
+        (SIM.replace("seed = 3", 'instruction = ""'), "task.instruction is empty: give a value or"),
+        (
+            SIM.replace("seed = 3", 'normalizer = "no"'),
+            "task.normalizer does nothing without task.re",
+        ),
+        (
+            REAL.replace("172.16.0.2", "172.16.0.300"),
+            "address '172.16.0.300' does not appear to be",
+        ),
+        (
+            REAL.replace("[640, 480]", "[480, 640]"),
+            "front.size must be width, then height: did you mean [640,",
+        ),
+        (
+            REAL.replace("force = 30.0", "force = 29.9"),
+            "gripper.force must lie between 30 and 70 N",
+        ),
         ("arm =", "is no TOML"),
         (SIM.replace("pick-place", "plug"), "task.policy: expert is for pick-place and bead-maze"),
         (SIM.replace("seed = 3", r'instruction = "\u001b"'), "task.instruction has control char"),

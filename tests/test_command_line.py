@@ -70,8 +70,18 @@ def test_a_bad_value_is_named_as_typed_and_a_mistyped_name_guessed(
     with pytest.raises(SystemExit):
         options("--env.mas", "1", "2")
     assert "Perhaps you meant" in capsys.readouterr().err
-    with pytest.raises(SystemExit, match="no command 'run-polcy'; did you mean run-policy?"):
+    with pytest.raises(SystemExit, match=r"no command 'run-polcy'; did you mean run-policy\?$"):
         main(["run-polcy"])
+
+
+def test_a_mistake_is_one_line_and_with_traceback_all_of_it() -> None:
+    huge = ["run-policy", "--episodes", "9" * 20]
+    with pytest.raises(
+        SystemExit, match="--episodes must be less than or equal to [0-9]*, not 9999"
+    ):
+        main(huge)
+    with pytest.raises(UserError, match="less than"):
+        main([*huge, "--traceback"])
 
 
 def test_version_and_lists(capsys: pytest.CaptureFixture) -> None:

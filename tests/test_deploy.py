@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,10 +27,10 @@ from running_twin import RunningTwin
 
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY
-from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
 from touchgoal.control.deployment.control_loop import Request, TickStatus
 from touchgoal.control.deployment.session import Session
-from touchgoal.control.interfaces import Actor
+from touchgoal.control.interfaces import Actor, DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.episodes.episode_recorder import EpisodeRecorder
@@ -37,7 +38,10 @@ from touchgoal.episodes.format.repair import validate
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.deploy import NOT_DONE, STOPPED
+from touchgoal.launch.support.cell_run import connect
+from touchgoal.launch.support.confirm import confirm
 from touchgoal.launch.twin import open_to_network
+from touchgoal.runtime.errors import UserError
 
 _PATIENCE = 600  # s for a loop, on a machine however loaded
 
@@ -193,8 +197,11 @@ class Turns:
     [
         ("np.zeros(7)", "act gave an array of shape (7,); return 7 joint changes (rad)"),
         ("np.full(8, np.nan)", "return finite numbers"),
-        ("1 / 0", "ZeroDivisionError: division by zero (own.py line 8)"),
-        ("observation['observation.state'].sort()", "read-only (own.py line 8)"),
+        ("1 / 0", "own.py:8 in Turns.act: ZeroDivisionError: division by zero"),
+        (
+            "observation['observation.state'].sort()",
+            "own.py:8 in Turns.act: ValueError: sort array is read-only",
+        ),
     ],
 )
 def test_a_wrong_policy_of_ones_own_stops_the_arm_with_its_name(
@@ -283,3 +290,32 @@ def test_a_simulated_arm_and_an_empty_chair_are_refused(tmp_path: Path) -> None:
         main(["arm", "home", "sim"])
     with pytest.raises(SystemExit, match="nobody is there to confirm"):
         main(["arm", "open", "ur5e"])
+
+
+def test_nobody_confirms_what_moves_nothing_real(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", None)
+    sim = read_cell_file(find_cell_file(Path("sim")))
+    confirm(sim)
+    real = read_cell_file(find_cell_file(Path("fr3_two_minis")))
+    confirm(replace(real, task=replace(real.task, twin=f"token@{real.address}:8081")))
+    for twin in ("", "token@127.0.0.1:8081"):  # a real arm, whatever else serves a twin
+        with pytest.raises(UserError, match="nobody is there to confirm"):
+            confirm(replace(real, task=replace(real.task, twin=twin)))
+
+
+def test_every_device_that_does_not_open_is_a_row(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_arm(*_: object) -> None:
+        raise DriverError("no controller answers")
+
+    monkeypatch.setattr("touchgoal.control.cell.connection.connect_arm", no_arm)
+    real = read_cell_file(find_cell_file(Path("fr3_two_minis")))
+    gone = replace(real, address="127.9.9.9", load_cell=None)
+    gone = replace(gone, gripper=replace(gone.gripper, address="127.9.9.9"))
+    with pytest.raises(UserError) as error:
+        connect(gone)
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("MISSING")]
+    names = [row.split()[1] for row in rows]
+    assert names == ["front", "tactile_left", "tactile_right", "gripper", "arm"]
+    assert all(f"{name}: " in str(error.value) for name in names) and "\n" not in str(error.value)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -21,7 +22,7 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import LearnedPolicy
-from touchgoal.policies.by_name import prepare_policy
+from touchgoal.policies.by_name import choose_policy, prepare_policy
 from touchgoal.policies.checkpoint import EPISODE_OBJECT, load_policy
 from touchgoal.policies.evaluation import evaluate as evaluation
 from touchgoal.policies.evaluation.evaluate import evaluate, run_trials, trial_specs
@@ -103,6 +104,53 @@ def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
     }.items():
         with pytest.raises(UserError, match=message):
             prepare_policy(name, config)
+
+
+OWN = """
+class Own:
+    def reset(self): pass
+    def act(self, observation): return self.helper(observation)
+    def helper(self, observation): return observation["observation.image"]
+"""
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("", "own.py:5 in Own.helper: KeyError: 'observation.image' (the observation has: obser"),
+        (
+            "    def __init__(self): self.gain",
+            "own.py:6 in Own.__init__: AttributeError: 'Own' obj",
+        ),
+        (
+            "    def reset(self): 1 / 0",
+            "own.py:6 in Own.reset: ZeroDivisionError: division by zero",
+        ),
+        (
+            "    def env_config(self, config): pass",
+            "own.py:Own: env_config gave None; return its op",
+        ),
+        (
+            "    def env_config(self, config): config.camera",
+            "own.py:6 in Own.env_config: Attribute",
+        ),
+        (
+            "    def env_config(self, config): type(config)(mas=1)",
+            "Own.env_config: PickPlaceConfig:",
+        ),
+        ("import nonesuch", "own.py:6: ModuleNotFoundError: No module named 'nonesuch'"),
+        ("def (", "own.py: SyntaxError: invalid syntax (own.py, line 6)"),
+    ],
+)
+def test_a_mistake_in_ones_own_policy_is_one_line(more: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(OWN + more)
+    for _ in range(2):  # a file that failed is not taken for a loaded one
+        with pytest.raises(UserError) as mistake:
+            make, _ = choose_policy(f"{tmp_path / 'own.py'}:Own", PickPlaceConfig())
+            policy = make(SimpleNamespace(n_joints=7))
+            policy.act({ft.STATE: np.zeros(15)})
+        assert message in str(mistake.value) and "\n" not in str(mistake.value)
+        assert message.startswith("own.py:Own:") or mistake.value.__cause__ is not None
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.published_touch.force_grasps import read_force_grasps
-from benchmarks.real_touch import forces, markers, property_probe
+from benchmarks.real_touch import forces, markers
 from benchmarks.real_touch.embedders import find_embedder
 from benchmarks.real_touch.property_probe import (
     adapted_nearest_is_same,

@@ -9,7 +9,9 @@ import pytest
 import serial
 from running_twin import RunningTwin, client
 
+from touchgoal.control.cell.twin_client import lease_twin
 from touchgoal.control.sensors.load_cell import parse
+from touchgoal.launch.support import cell_run
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.twin.mjpeg import Stream
 
@@ -167,6 +169,16 @@ def test_load_cell_weighs_is_garbled_and_unplugged(fr3: RunningTwin) -> None:
     fr3.ask("plug load_cell")
     with serial.Serial(config.port, 115200, timeout=2) as device:
         assert None not in readings(5)
+
+
+def test_one_deployment_at_a_time_uses_a_twin(fr3: RunningTwin) -> None:
+    fr3.begin("reset 5")
+    with lease_twin(fr3.cell.task.twin):
+        before = fr3.ask("truth")["layout"]
+        with pytest.raises(UserError, match="another deploy uses this twin"):
+            cell_run.connect(fr3.cell)  # of another seed: it would put the scene back
+        assert fr3.ask("truth")["layout"] == before
+    lease_twin(fr3.cell.task.twin).close()
 
 
 def test_web_pages_and_nonsense_change_nothing_at_the_control_port(fr3: RunningTwin) -> None:

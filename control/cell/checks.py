@@ -11,8 +11,8 @@ from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime.errors import UserError
 
-# Range of grasp forces, N. The simulated Franka Hand can press less than the real one's least, 30.
-_FORCES = {"franka_hand": (0.0, 70.0), "robotiq": ROBOTIQ_2F85.force}
+# Range of grasp forces, N; a simulated Franka Hand can press less.
+_FORCES = {"franka_hand": (30.0, 70.0), "robotiq": ROBOTIQ_2F85.force}
 _JOINTS = {"fr3": 7, "ur5e": 6, "sim": 7}
 _LEAST_FINGERTIP = 0.01  # m, each side of the box around the fingertips
 _UNIT = 1e-3  # by which a quaternion's length may differ from 1
@@ -52,6 +52,8 @@ def _check_devices(cell: CellConfig) -> None:
                 "two GelSight Minis"
             )
     least, most = _FORCES[gripper.kind]
+    if gripper.kind == "franka_hand" and cell.moves_nothing_real:
+        least = 0.0
     if not least <= gripper.force <= most:
         raise UserError(
             f"gripper.force must lie between {least:g} and {most:g} N, what a {gripper.kind} can do, "
@@ -65,6 +67,9 @@ def _check_fingertips(cell: CellConfig) -> None:
     tips = cell.fingertips
     if tips is None:
         return
+    for side, source in (("left", tips.left), ("right", tips.right)):
+        if source != "simulated" and get_close_matches(source, ["simulated"], 1):
+            raise UserError(f"fingertips.{side} is {source!r}: did you mean 'simulated'?")
     if cell.arm != "sim" and tips.left == tips.right:
         raise UserError(
             f"fingertips.left and fingertips.right are both {tips.left!r}: give each its own sensor"
@@ -114,6 +119,9 @@ def _check_own_task(task: TaskSection) -> None:
 
 def _check_task(cell: CellConfig) -> None:
     task = cell.task
+    if not task.rewards and (task.normalizer or task.encoder):
+        what = "normalizer" if task.normalizer else "encoder"
+        raise UserError(f"task.{what} does nothing without task.rewards: name a goal there")
     if task.start is not None and len(task.start) != _JOINTS[cell.arm]:
         raise UserError(
             f"task.start must be {_JOINTS[cell.arm]} joint positions of the {cell.arm} in rad, "

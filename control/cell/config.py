@@ -3,10 +3,12 @@
 `cell_file` puts each field's description and range into its messages.
 """
 
+import re
 from dataclasses import field
+from ipaddress import ip_address
 from typing import Annotated, Literal, cast, get_args
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from touchgoal.control.sensors.load_cell import LoadCellConfig
@@ -24,6 +26,22 @@ Pixels = Annotated[int, Field(ge=16, le=8192)]
 Exposure = Annotated[float, Field(gt=0, le=100_000)]
 Width = Annotated[float, Field(ge=0, le=0.2)]  # m
 Kelvin = Annotated[int, Field(ge=1000, le=15_000)]
+
+
+def _landscape(size: tuple[int, int]) -> tuple[int, int]:
+    if size[0] < size[1]:
+        raise ValueError(f"must be width, then height: did you mean {[*size[::-1]]}?")
+    return size
+
+
+def _address(text: str) -> str:
+    if re.fullmatch(r"[\d.]+", text):
+        ip_address(text)  # raises ValueError
+    return text
+
+
+Size = Annotated[tuple[Pixels, Pixels], AfterValidator(_landscape)]
+Address = Annotated[str, AfterValidator(_address)]  # numbers or a name
 CameraName = Literal["front", "wrist"]
 SimulatedTask = Literal["pick-place", "bead-maze"]
 """Tasks of the simulator that `deploy` and `twin` know."""
@@ -40,7 +58,7 @@ class GripperSection:
 
     kind: Literal["franka_hand", "robotiq"]
     """franka_hand needs `address`, robotiq needs `port`."""
-    address: str = ""
+    address: Address = ""
     """Network address of a Franka Hand: the same as the arm's."""
     port: str = ""
     """Serial port of a Robotiq, such as /dev/ttyUSB0."""
@@ -83,7 +101,7 @@ class FingertipsSection:
     """Pictures a second, Hz; default: the model's."""
     sensor_files: tuple[str, str] | None = None
     """Folders that calibrate wrote for the left and the right sensor; default: the model's for both."""
-    size: tuple[Pixels, Pixels] | None = None
+    size: Size | None = None
     """Width and height to ask the sensors' cameras for, pixels; default: their default."""
     border: Annotated[float, Field(ge=0, lt=0.5)] | None = None
     """Share cut off at each side of a camera's picture; default: the model's."""
@@ -104,7 +122,7 @@ class CameraSection:
     """Device (/dev/video2), index, or address of a stream."""
     rate: Rate = 30.0
     """Pictures a second, Hz."""
-    size: tuple[Pixels, Pixels] | None = None
+    size: Size | None = None
     """Width and height to ask the camera for, pixels; default: its default."""
     exposure: Exposure | None = None
     """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); default: as it is set."""
@@ -219,7 +237,7 @@ class CellConfig:
     """The task."""
     tool: ToolSection | None = None
     """Gripper, mounts and fingertips together; a simulated arm has its own."""
-    address: str = ""
+    address: Address = ""
     """Network address of the arm's controller, such as 172.16.0.2."""
     fingertips: FingertipsSection | None = None
     """The two fingertip sensors."""
@@ -231,6 +249,12 @@ class CellConfig:
     """Limits for this cell."""
     lock_step: bool = False
     """Whether the arm is a twin that waits for its client; the control loop then follows its clock."""
+
+    @property
+    def moves_nothing_real(self) -> bool:
+        """Whether the arm is simulated: in this program, or by a twin at the arm's own address."""
+        host = self.task.twin.rpartition("@")[2].rpartition(":")[0]
+        return self.arm == "sim" or bool(host) and host == self.address
 
     @property
     def time_waits(self) -> bool:

@@ -33,7 +33,7 @@ def read_config(path: Path, kind: type[Config], name: str) -> Config:
     ) as error:
         form = "JSON" if path.suffix == ".json" else "TOML"
         raise UserError(f"{path} is no {form}: {error}") from error
-    _refuse_control_characters(path, table)
+    _check_texts(path, table)
     try:
         # By way of JSON, in which lists pass for tuples and nothing else is converted.
         return TypeAdapter(kind).validate_json(json.dumps(table, default=str), strict=True)
@@ -61,20 +61,22 @@ def first_mistake(error: ValidationError, kind: type) -> str:
         return f"{name} must have {first['ctx']['max_length']} values, not {value!r}: {meaning}"
     if problem == "missing":
         return f"{name} is missing: {meaning}"
-    rule = first["msg"].replace("Input should", "must")
+    rule = first["msg"].replace("Input should", "must").removeprefix("Value error, ")
     if problem == "dataclass_type":
         rule = "must be a section with keys of its own"
     return f"{name} {rule}, not {value!r}: {meaning}"
 
 
-def _refuse_control_characters(path: Path, value: Any, name: str = "") -> None:
-    """UserError if a text has escapes or line breaks: it is printed on the operator's terminal."""
+def _check_texts(path: Path, value: Any, name: str = "") -> None:
+    """UserError if a text is empty, or has escapes or line breaks: it is printed on a terminal."""
     if isinstance(value, dict):
         for key, part in value.items():
-            _refuse_control_characters(path, part, f"{name}.{key}".lstrip("."))
+            _check_texts(path, part, f"{name}.{key}".lstrip("."))
     elif isinstance(value, list):
         for part in value:
-            _refuse_control_characters(path, part, name)
+            _check_texts(path, part, name)
+    elif value == "":
+        raise UserError(f"{path}: {name} is empty: give a value or leave it out")
     elif isinstance(value, str) and not value.isprintable():
         raise UserError(f"{path}: {name} has control characters, {value!r}: leave them out")
 

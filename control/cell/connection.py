@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import partial
+from socket import socket
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -26,6 +27,7 @@ from touchgoal.control.sensors.load_cell import SerialLoadCell
 from touchgoal.control.sensors.tactile_camera import TactileCamera, fingertip_view
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.runtime.errors import CheckResult, UserError, require_all_ok
 
 # Hz, and s of wall time without a picture: slow enough for any loaded machine.
 _LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 0.1, 10.0
@@ -112,11 +114,13 @@ class CellConnection:
     load_cell: LoadCell | None
     clock: Clock = field(default_factory=RealClock)
     truth: Callable[[], dict[str, Any]] | None = None
+    lease: socket | None = None  # of the twin; others may use it once this is closed
 
     def close(self) -> None:
         """Close the arm first; a device that fails to close is named, and holds up nothing."""
         clock = self.clock if isinstance(self.clock, LockStepClock) else None
-        for device in (clock, self.arm, self.gripper, *self.cameras.values(), self.load_cell):
+        devices = (self.arm, self.gripper, *self.cameras.values(), self.load_cell)
+        for device in (clock, *devices, self.lease):
             try:
                 if device is not None:
                     device.close()
@@ -128,18 +132,32 @@ def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellC
     """Connect to everything in a cell with a real arm or a twin; commands will come at `hz`.
 
     A lock-step twin begins the episode of `task.seed`, or goes on with its own if not `new_episode`.
-    UserError or DriverError if a device is missing; the connected ones are released.
+    UserError names all devices that do not open, after a row for each; the others are released.
     """
-    robot = cell_limits(cell)
+    robot, rows = cell_limits(cell), list[CheckResult]()
     with ExitStack() as undo:
-        cameras: dict[str, Camera] = {}
-        for key in camera_formats(cell):
-            cameras[key] = undo.enter_context(closing(connect_camera(cell, key)))
+
+        def opened(name: str, open_device: Callable[[], Any]) -> Any:
+            try:
+                device = undo.enter_context(closing(open_device()))
+                rows.append(CheckResult(name, True, "opened"))
+            except UserError as error:
+                device = None
+                rows.append(CheckResult(name, False, "", str(error)))
+            return device
+
+        cameras: dict[str, Camera] = {
+            key: opened(key.removeprefix(ft.IMAGE_PREFIX), partial(connect_camera, cell, key))
+            for key in camera_formats(cell)
+        }
         load_cell = None
         if cell.load_cell:
-            load_cell = undo.enter_context(closing(SerialLoadCell(cell.load_cell)))
-        gripper = undo.enter_context(closing(_gripper(cell)))
-        arm = undo.enter_context(closing(connect_arm(cell, hz)))
+            load_cell = opened("load cell", partial(SerialLoadCell, cell.load_cell))
+        gripper = opened("gripper", partial(_gripper, cell))
+        arm = opened("arm", partial(connect_arm, cell, hz))
+        if not all(row.ok for row in rows):
+            print("\n".join(map(str, rows)), flush=True)
+            require_all_ok(rows)
         clock: Clock = RealClock()
         if cell.lock_step and isinstance(gripper, FrankaHand):
             clock = LockStepClock(cell.task.twin, arm, gripper, cameras, load_cell)

@@ -4,7 +4,7 @@ import json
 import socket
 import time
 from collections import deque
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import numpy as np
@@ -36,11 +36,26 @@ def connect_control_port(address: str) -> socket.socket:
 
 def ask_twin(address: str, line: str) -> dict[str, Any]:
     """Send a line to a twin's control port and return the answer; UserError if refused."""
+    with connect_control_port(address) as connection:
+        return _ask(connection, address, line)
+
+
+def lease_twin(address: str) -> socket.socket:
+    """Take a twin until the returned connection is closed; UserError if another deployment has it."""
+    connection = connect_control_port(address)
+    with ExitStack() as undo:
+        undo.enter_context(connection)
+        _ask(connection, address, "lease")
+        undo.pop_all()
+    return connection
+
+
+def _ask(connection: socket.socket, address: str, line: str) -> dict[str, Any]:
     token, _, where = address.rpartition("@")
     try:
-        with connect_control_port(address) as connection:
-            connection.sendall(f"{token} {line}\n".encode())
-            answer = json.loads(connection.makefile().readline())
+        connection.sendall(f"{token} {line}\n".encode())
+        with connection.makefile() as answers:
+            answer = json.loads(answers.readline())
     except (OSError, json.JSONDecodeError) as error:
         raise UserError(f"no twin answers at {where}; start one: touchgoal twin") from error
     if "error" in answer:

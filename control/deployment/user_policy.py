@@ -10,10 +10,12 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any
 
 import numpy as np
@@ -23,7 +25,10 @@ from touchgoal.control import features as ft
 from touchgoal.control.features import Observation, read_only
 from touchgoal.control.interfaces import Planner, Policy
 from touchgoal.control.policy_server.policy import ServedPolicy
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import RefusedError, UserError
+
+# Beginnings of files that are not the user's.
+_NOT_THEIRS = str(Path(__file__).parents[2]), str(Path(importlib.__file__).parent), "<frozen"
 
 
 class UserPolicy(Planner):
@@ -32,7 +37,8 @@ class UserPolicy(Planner):
     def __init__(self, name: str, given: Any = None, env: Any = None) -> None:
         """Make the policy; in an environment its episode begins, else call `reset` before `act`.
 
-        UserError: no such class, it lacks a method, or it takes arguments.
+        UserError: no such class, it lacks a method, or it takes arguments; here as in the methods,
+        a mistake in the user's code, by file and line.
 
         Args:
             name: `module:Class` or `file.py:Class`, for messages, too.
@@ -47,11 +53,13 @@ class UserPolicy(Planner):
 
     def reset(self) -> None:
         """Begin an episode."""
-        self._policy.reset()
+        with _their_mistakes_named(self._name):
+            self._policy.reset()
 
     def act(self, observation: Observation) -> Float32[np.ndarray, " a"]:
         """Return the next action; UserError if not finite or not of the robot's shape."""
-        answer = self._policy.act(read_only(observation))
+        with _their_mistakes_named(self._name, observation):
+            answer = self._policy.act(read_only(observation))
         self.done = bool(getattr(self._policy, "done", False))
         wanted = f"{self._n_joints} joint changes (rad) and the gripper's width (m)"
         try:
@@ -75,7 +83,38 @@ class UserPolicy(Planner):
     def env_config(self, config: Any, /) -> Any:
         """Return the environment's options as the policy's own `env_config` changes them."""
         change = getattr(self._policy, "env_config", None)
-        return config if change is None else change(config)
+        if change is None:
+            return config
+        with _their_mistakes_named(self._name):
+            changed = change(config)
+        if not isinstance(changed, type(config)):
+            raise UserError(f"{self._name}: env_config gave {changed!r:.60}; return its options")
+        return changed
+
+
+@contextmanager
+def _their_mistakes_named(name: str, keys: Iterable[str] = ()) -> Iterator[None]:
+    """Raise UserError for an exception of the user's code: file, line, method and what is wrong.
+
+    `name` is the policy's, `keys` are those of the observation it was given.
+    """
+    try:
+        yield
+    except RefusedError:
+        raise
+    except Exception as error:
+        where = name
+        frames = [(f.f_code, line) for f, line in walk_tb(error.__traceback__)]
+        theirs = [f for f in frames if not f[0].co_filename.startswith(_NOT_THEIRS)]
+        if theirs:
+            code, line = [f for f in theirs if f[0].co_filename == theirs[0][0].co_filename][-1]
+            method = "" if code.co_name == "<module>" else f" in {code.co_qualname}"
+            where = f"{Path(code.co_filename).name}:{line}{method}"
+        what = " ".join(str(error).split())
+        if isinstance(error, KeyError) and keys:
+            what += f" (the observation has: {', '.join(keys)})"
+        kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
+        raise UserError(f"{where}: {kind}{what}") from error
 
 
 def find_user_policy(
@@ -108,7 +147,8 @@ def _make(name: str, found: Any) -> Policy:
         ) from None
     except ValueError:  # no signature, as of a class from C
         pass
-    return found()
+    with _their_mistakes_named(name):
+        return found()
 
 
 def _import(name: str) -> Any:
@@ -123,10 +163,8 @@ def _import(name: str) -> Any:
 
 
 def _import_module(name: str) -> Any:
-    try:
+    with _their_mistakes_named(name):
         return importlib.import_module(name)
-    except ImportError as error:
-        raise UserError(f"cannot import {name} for the policy: {error}") from error
 
 
 def _import_file(path: Path) -> Any:
@@ -141,5 +179,10 @@ def _import_file(path: Path) -> Any:
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    spec.loader.exec_module(module)
+    try:
+        with _their_mistakes_named(path.name):
+            spec.loader.exec_module(module)
+    except UserError:
+        del sys.modules[name]
+        raise
     return module

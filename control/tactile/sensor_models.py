@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from touchgoal.control.tactile.sensor_calibration import load
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, unknown_name
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ SENSORS = {
 def find_model(name: str) -> SensorModel:
     """Return a sensor model by name; UserError if there is none."""
     if name not in SENSORS:
-        raise UserError(f"unknown sensor {name!r}; choose from: {', '.join(SENSORS)}")
+        raise unknown_name("sensor", name, SENSORS)
     return SENSORS[name]
 
 
@@ -159,8 +159,7 @@ def find_sensor(name: str) -> SensorModel:
         return SENSORS[name]
     folder = Path(name)
     if not folder.is_dir():
-        known = ", ".join(SENSORS)
-        raise UserError(f"{name} is no sensor and no folder; choose a sensor file or: {known}")
+        raise unknown_name("sensor or folder of a sensor file", name, SENSORS)
     own = load(folder)
     if own.sensor not in SENSORS:
         raise UserError(f"{folder} is of an unknown sensor, {own.sensor}")

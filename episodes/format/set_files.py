@@ -8,6 +8,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from touchgoal.episodes.format.other_formats import refuse_other_format
 from touchgoal.episodes.schema import drop_pixel_format
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.json_file import parse_json
@@ -97,6 +98,7 @@ def read_video(root: Path, name: str, crc32: int) -> bytes:
 def load_info(root: Path) -> dict[str, Any]:
     """Read meta/info.json. UserError: no set, another version, or an impossible value."""
     if not (root / INFO).exists():
+        refuse_other_format(root)
         raise UserError(
             f"{root} is not a set of episodes (it has no {INFO}): give the folder that a recording "
             f"command wrote; if a first recording was interrupted there, {repair_command(root)}"

@@ -19,7 +19,7 @@ from tyro.constructors import (
 )
 
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.option_types import FIXED, RARE, OptionError
+from touchgoal.runtime.option_types import FIXED, LARGEST, RARE, OptionError
 from touchgoal.sim_envs.config import EnvConfig
 
 SHOWN = 20  # options that --help shows; --help-all shows all of them
@@ -164,7 +164,7 @@ def _bounds(annotation: Any) -> Iterator[str]:
                     yield f"at least {bound}"
                 case annotated_types.Lt(lt=bound):
                     yield f"below {bound}"
-                case annotated_types.Le(le=bound):
+                case annotated_types.Le(le=bound) if bound != LARGEST:
                     yield f"at most {bound}"
     for part in get_args(annotation):
         yield from _bounds(part)

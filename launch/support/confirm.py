@@ -10,7 +10,9 @@ if TYPE_CHECKING:
 
 
 def confirm(cell: "CellConfig") -> None:
-    """UserError unless the operator types which arm is to move."""
+    """UserError unless the operator types which arm is to move, or it is simulated."""
+    if cell.moves_nothing_real:
+        return
     name = f"{cell.arm} {cell.address}".strip()
     if sys.stdin is None or not sys.stdin.isatty():
         raise UserError("nobody is there to confirm: run it in a terminal, or add --yes")

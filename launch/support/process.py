@@ -6,11 +6,14 @@ import os
 import select
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import Terminated, terminable
+from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.run_folder import release_runs
 
 _WRITE_ERRORS = {  # errno -> advice
@@ -24,19 +27,25 @@ _WRITE_ERRORS = {  # errno -> advice
 def run_command(program: str, arguments: list[str], action: Callable[..., None]) -> None:
     """Call `action(*arguments)`, a command's name and options, as `program`.
 
-    Exit status: 1 after a user's mistake or a failed write, in one line on stderr (2 if tyro finds
+    With `--traceback` among them a user's mistake shows its traceback, as a bug does. Exit status: 1 after a user's mistake or a failed write, in one line on stderr (2 if tyro finds
     it), 130 after Ctrl-C and 143 after SIGTERM.
     """
-    prog = f"{program} {arguments[0]}"
+    prog, whole = f"{program} {arguments[0]}", "--traceback" in arguments
+    arguments = [argument for argument in arguments if argument != "--traceback"]
     with _recorded_as([program, *arguments]), terminable():
-        _report_errors(prog, action, arguments)
+        _report_errors(prog, action, arguments, whole)
 
 
-def _report_errors(prog: str, action: Callable[..., None], arguments: list[str]) -> None:
+def _report_errors(
+    prog: str, action: Callable[..., None], arguments: list[str], whole: bool
+) -> None:
     try:
         _require_working_directory()
         action(*arguments)
     except UserError as error:
+        _tell_torchrun(f"{prog}: {error}")
+        if whole:
+            raise
         sys.exit(f"{prog}: {error}")
     except OSError as error:
         if error.errno not in _WRITE_ERRORS:
@@ -50,6 +59,12 @@ def _report_errors(prog: str, action: Callable[..., None], arguments: list[str])
         sys.exit(128 + stopped_by)
     finally:
         release_runs()
+
+
+def _tell_torchrun(message: str) -> None:
+    """Leave the message where torchrun, which prints a traceback of its own, ends with it."""
+    if path := os.environ.get("TORCHELASTIC_ERROR_FILE"):
+        write_json(Path(path), {"message": message, "timestamp": int(time.time())})
 
 
 def _require_working_directory() -> None:

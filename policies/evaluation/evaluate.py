@@ -16,7 +16,7 @@ from touchgoal.episodes.recording import EpisodeSpec, run
 from touchgoal.policies.by_name import prepare_policy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
-from touchgoal.runtime.errors import RefusedError, UserError
+from touchgoal.runtime.errors import RefusedError, UserError, unknown_name
 from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import ENVS, TaskConfig
@@ -183,5 +183,5 @@ def _task_config(task: str | TaskConfig) -> TaskConfig:
     if not isinstance(task, str):
         return task
     if task not in ENVS:
-        raise UserError(f"there is no task {task!r}: choose from {', '.join(ENVS)}")
+        raise unknown_name("task", task, ENVS)
     return ENVS[task]

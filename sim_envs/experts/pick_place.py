@@ -8,7 +8,7 @@ import numpy as np
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.rotations import fingers_down
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, unknown_name
 from touchgoal.sim_envs.cell.hardware import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.config import Outcome
 from touchgoal.sim_envs.experts.pick_place_plans import (
@@ -82,7 +82,7 @@ class PickPlaceExpert(Actor):
 
 def _check(env: PickPlace, outcome: Outcome) -> None:
     if outcome not in OUTCOMES:
-        raise UserError(f"unknown outcome {outcome!r}; choose from: {', '.join(OUTCOMES)}")
+        raise unknown_name("outcome", outcome, OUTCOMES)
     if outcome == "wrong_object" and len(env.bodies) < 2:
         raise UserError("outcome wrong_object needs a second object; set distractors to 1")
     if outcome == "same_shape" and env.asked == env.bodies[0].kind.name:

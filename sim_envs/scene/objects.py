@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, unknown_name
 
 Shape = Literal["box", "cylinder", "sphere", "capsule", "mesh"]
 SHAPES: tuple[Shape, ...] = ("box", "cylinder", "sphere", "capsule", "mesh")
@@ -134,7 +134,7 @@ def find_object(name: str) -> ObjectKind:
         return _own_kind(name)
     known = CATALOGUE | NEW_KINDS
     if name not in known:
-        raise UserError(f"unknown object {name!r}; choose from: {', '.join(known)}")
+        raise unknown_name("object", name, known)
     return known[name]
 
 

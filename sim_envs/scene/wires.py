@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.runtime import seeds
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, unknown_name
 
 Family = Literal["fourier", "roller", "helix", "arc", "serpentine"]
 Split = Literal["training", "validation", "test"]
@@ -139,10 +139,10 @@ def choose(split: Split, count: int, families: tuple[Family, ...] = TRAINED) -> 
     Within a family no two wires of any split are closer than `APART`.
     """
     if split not in seeds.WIRES:
-        raise UserError(f"unknown split {split!r}; choose from: {', '.join(seeds.WIRES)}")
+        raise unknown_name("split", split, seeds.WIRES)
     for family in families:
         if family not in FAMILIES:
-            raise UserError(f"unknown family {family!r}; choose from: {', '.join(FAMILIES)}")
+            raise unknown_name("family", family, FAMILIES)
     each = -(-count // len(families))
     if each > PER_FAMILY[split]:
         raise UserError(

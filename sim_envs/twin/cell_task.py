@@ -4,6 +4,8 @@ from dataclasses import replace
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CameraSection, CellConfig
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import OptionError
 from touchgoal.sim_envs.config import (
     BeadMazeConfig,
     CameraPlacement,
@@ -13,10 +15,17 @@ from touchgoal.sim_envs.config import (
 
 
 def env_config_of(config: CellConfig) -> TaskConfig:
-    """Return the task's options with the cell's sensors, at the rate of a deployment."""
-    task: TaskConfig = PickPlaceConfig(objects=config.task.objects)
-    if config.task.simulated == "bead-maze":
-        task = BeadMazeConfig(wires=config.task.wires)
+    """Return the task's options with the cell's sensors, at the rate of a deployment.
+
+    UserError: an object or wire that does not exist.
+    """
+    try:
+        task: TaskConfig = PickPlaceConfig(objects=config.task.objects)
+        if config.task.simulated == "bead-maze":
+            task = BeadMazeConfig(wires=config.task.wires)
+    except OptionError as error:
+        wrong = "; ".join(f"task.{key}: {what}" for key, what in error.problems)
+        raise UserError(wrong) from error
     return replace(
         task,
         cameras=tuple(config.cameras),

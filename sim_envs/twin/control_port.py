@@ -1,6 +1,7 @@
 """Control port of the twin: commands that reset the scene, inject faults and return the truth.
 
     truth                           ground truth, and the state of arm and gripper
+    lease                           take the twin until this connection closes; refused if taken
     reset SEED [OPTIONS]            reset scene, arm and hand to an episode's start, clear errors;
                                     OPTIONS: the task's reset options as a JSON object
     hold                            stop a lock-step twin's time until this connection closes
@@ -77,6 +78,7 @@ class ControlPort(Service):
         self._lock_step, self._on_reset = lock_step, on_reset
         self._cell, self._arm, self._pictures, self._ports = cell, arm, pictures, ports
         self._listener = ListeningPort(host, port)
+        self._lessee: ClientConnection | None = None  # the deployment that uses the twin
         self._frozen_seconds = 0.0  # s, simulated: else a slow machine would end it too soon
         self._token = secrets.token_hex(8)
         self.address = f"{self._token}@{host}:{self._listener.port}"
@@ -121,6 +123,7 @@ class ControlPort(Service):
         command, _, rest = line.partition(" ")
         actions = {
             "truth": self._cell.truth,
+            "lease": lambda: self._lease(client),
             "hold": lambda: self._held_time().hold(client),
             "advance": None,
             "pictures": None,
@@ -158,6 +161,11 @@ class ControlPort(Service):
         if self._lock_step is None:
             raise UserError("this twin is not in lock-step: start it with --lock-step")
         return self._lock_step
+
+    def _lease(self, client: ClientConnection) -> None:
+        if self._lessee is not None and self._lessee.open:
+            raise UserError("another deploy uses this twin: end it, or start a second twin")
+        self._lessee = client
 
     def _reset(self, seed: str, options: str = "{}") -> None:
         if self._cell.moving:

@@ -1,5 +1,6 @@
 """The twin: one loop of all wire services and the physics, 1 ms at a time."""
 
+import os
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -68,6 +69,7 @@ class Twin:
         self._lock_step: LockStep | None = None
         self._next_step_at = time.monotonic()
         self.stopped = False  # set it to end `run`
+        self.parent: int | None = None  # process with which `run` ends, too
         self.pace = Pace()
         self._services: list[Service] = []
         with ExitStack() as undo:
@@ -76,14 +78,14 @@ class Twin:
                 self.cell_config = self._open(config)  # content of the cell file
             except OSError as error:
                 raise UserError(
-                    f"cannot serve at {config.host} ({error.strerror}); if another twin is there, "
-                    "end it or choose another address: --host 127.0.0.2"
+                    f"cannot serve at {config.host} ({error.strerror}): give an address of this "
+                    "computer at which no other twin is, such as --host 127.0.0.2"
                 ) from error
             undo.pop_all()
 
     def run(self) -> None:
-        """Serve until `stopped`."""
-        while not self.stopped:
+        """Serve until `stopped`, or until the parent has ended."""
+        while not self.stopped and self.parent in (None, os.getppid()):
             self.step()
 
     def step(self) -> None:

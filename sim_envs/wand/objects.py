@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import unknown_name
 from touchgoal.sim_envs.scene.objects import Material, Texture
 from touchgoal.sim_envs.wand.meshes import COARSE, Mesh, ellipsoid, lathe, prism
 
@@ -67,7 +67,7 @@ def wand_objects() -> dict[str, WandObject]:
 def find_wand_object(name: str) -> WandObject:
     """Return an object; UserError lists the names."""
     if name not in wand_objects():
-        raise UserError(f"unknown object {name!r}; choose from: {', '.join(wand_objects())}")
+        raise unknown_name("object", name, wand_objects())
     return wand_objects()[name]
 
 
