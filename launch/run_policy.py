@@ -67,15 +67,14 @@ def main(config: Config) -> None:
     cell = "sim" if config.task == "pick-place" else "sim_maze"
     if changed := _changed_options(config):
         print(
-            f"next, the cell to it: touchgoal twin --task {config.task} {changed} --out runs/twin"
+            f"next, serve this task: touchgoal twin --task {config.task} {changed} --out runs/twin"
         )
         cell = "runs/twin/cell.json"
     command = f"touchgoal deploy {cell} --execute --policy {shlex.quote(config.policy)}"
     if config.target and EPISODE_OBJECT not in config.target:
         command += f" --target {shlex.quote(config.target)}"
-    print(
-        f"{'meanwhile' if changed else 'next'}, in the loop that also drives a real arm: {command}"
-    )
+    when = "then, in another terminal" if changed else "next"
+    print(f"{when}, by the control loop that also drives a real arm: {command}")
 
 
 def _changed_options(config: Config) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from command_options import options_by_command
+from torch.distributed.elastic.multiprocessing.errors import ProcessFailure
 
 from touchgoal import __version__
 from touchgoal.launch.__main__ import COMMANDS, main
@@ -82,6 +83,15 @@ def test_a_mistake_is_one_line_and_with_traceback_all_of_it() -> None:
         main(huge)
     with pytest.raises(UserError, match="less than"):
         main([*huge, "--traceback"])
+
+
+def test_torchrun_ends_with_the_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its agent prints what a failed rank leaves in this file as the last line of its report."""
+    monkeypatch.setenv("TORCHELASTIC_ERROR_FILE", str(tmp_path / "error.json"))
+    with pytest.raises(SystemExit) as ended:
+        main(["demo", "--out", "/proc/run"])
+    failure = ProcessFailure(0, 1, 1, str(tmp_path / "error.json"))
+    assert failure.message == str(ended.value) and "cannot write in /proc" in failure.message
 
 
 def test_version_and_lists(capsys: pytest.CaptureFixture) -> None:

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,32 @@ from touchgoal.control import features as ft
 from touchgoal.episodes.format import metadata, set_files
 from touchgoal.episodes.format.repair import repair, validate
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.rewards.sources.open_source import open_source
 from touchgoal.runtime.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("name", "begin", "told"),
+    [
+        ("demo.hdf5", b"", "HDF5, as robomimic"),
+        ("log.mcap", b"", "an MCAP log"),
+        ("run.bag", b"", "a ROS bag"),
+        ("run_0.db3", b"", "a ROS 2 bag"),
+        ("a.npz", b"", "a NumPy archive"),
+        ("a.npy", b"", "a NumPy array"),
+        ("a.pkl", b"", "a Python pickle"),
+        ("renamed.mp4", b"\x89HDF\r\n\x1a\n", "HDF5, as robomimic"),
+    ],
+)
+def test_another_format_is_known_by_name(
+    name: str, begin: bytes, told: str, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(begin + bytes(100))
+    folder = [] if path.suffix == ".mp4" else [partial(open_source, tmp_path, "front")]
+    for reader in (partial(open_source, path, "front"), partial(EpisodeSet, path), *folder):
+        with pytest.raises(UserError, match=f"{name} is {told}.*convert it to a LeRobotDataset v3"):
+            reader()
 
 
 def cut_in_half(path: Path) -> None:

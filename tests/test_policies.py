@@ -1,6 +1,7 @@
 """Judging policies, shipped and one's own; what is recorded for them and what they learn from."""
 
 import json
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from rerun_rows import rerun_rows
+from toy_episodes import record
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.weights import WeightsFormat
@@ -19,7 +21,9 @@ from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.launch.__main__ import main
+from touchgoal.launch.__main__ import main, read_options
+from touchgoal.launch.run_policy import Config as RunPolicy
+from touchgoal.launch.run_policy import _changed_options
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.by_name import choose_policy, prepare_policy
@@ -31,6 +35,7 @@ from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.evaluation.table import table
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.sight.frozen_images import ImageEmbedder, ImageInputConfig
+from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.policies.training.training_data import choose_episodes, common_sensor, find_task
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
@@ -151,6 +156,38 @@ def test_a_mistake_in_ones_own_policy_is_one_line(more: str, message: str, tmp_p
             policy.act({ft.STATE: np.zeros(15)})
         assert message in str(mistake.value) and "\n" not in str(mistake.value)
         assert message.startswith("own.py:Own:") or mistake.value.__cause__ is not None
+
+
+class Stopped:
+    """A frozen encoder that Ctrl-C stops once at its third episode."""
+
+    name, shape = "toy", (1,)
+
+    def __init__(self) -> None:
+        self.embedded: list[int] = []
+
+    def embed(self, episodes: EpisodeSet, i: int) -> np.ndarray:
+        self.embedded.append(i)
+        if self.embedded == [0, 1, 2]:
+            raise KeyboardInterrupt
+        return np.full((episodes.lengths[i], 1), i)
+
+
+def test_a_stop_while_embedding_costs_one_episode(tmp_path: Path) -> None:
+    record(tmp_path, range(4))
+    encoder, episodes = Stopped(), EpisodeSet(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        embed_episodes(episodes, range(4), encoder)
+    rows = embed_episodes(EpisodeSet(tmp_path), range(4), encoder)
+    assert encoder.embedded == [0, 1, 2, 2, 3]
+    assert [row[0, 0] for row in rows] == [0, 1, 2, 3]
+
+
+def test_what_comes_next_has_the_options_of_the_task() -> None:
+    env = PickPlaceConfig(objects=("wooden_block",), cameras=(), tactile=False)
+    _, twin = read_options("twin", shlex.split(_changed_options(RunPolicy(env=env))))
+    assert twin.env.objects == env.objects and not twin.env.tactile and not twin.env.cameras
+    assert not _changed_options(RunPolicy())
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,11 @@
 """The twin over the wire: its controllers by their makers' clients, its load cell, its control port."""
 
+import os
 import socket
+import subprocess
+import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +17,9 @@ from touchgoal.control.cell.twin_client import lease_twin
 from touchgoal.control.sensors.load_cell import parse
 from touchgoal.launch.support import cell_run
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.twin.mjpeg import Stream
+from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
 HOME = [0.0, -0.3, 0.0, -2.2, 0.0, 1.9, 0.785]
 
@@ -179,6 +185,27 @@ def test_one_deployment_at_a_time_uses_a_twin(fr3: RunningTwin) -> None:
             cell_run.connect(fr3.cell)  # of another seed: it would put the scene back
         assert fr3.ask("truth")["layout"] == before
     lease_twin(fr3.cell.task.twin).close()
+
+
+def test_a_twin_ends_with_what_started_it_and_says_its_pace(tmp_path: Path) -> None:
+    arguments = f"--port 0 --host 127.77.{os.getpid() % 250}.1 --env.no-tactile --env.cameras"
+    twin = f"{sys.executable} -m touchgoal.launch twin {arguments} --out {tmp_path}"
+    wait = f"until [ -e {tmp_path}/cell.json ]; do sleep 0.1; done"
+    log = tmp_path / "log"
+    subprocess.run(["sh", "-c", f"{twin} >{log} 2>&1 </dev/null & {wait}"], check=True, timeout=120)
+    deadline = time.monotonic() + 30
+    while not log.read_text().endswith("no pace to report\nstopped\n"):
+        assert time.monotonic() < deadline, log.read_text()
+        time.sleep(0.1)
+    assert (tmp_path / "metrics.json").exists()
+
+
+def test_a_host_of_no_interface_is_told() -> None:
+    blind = PickPlaceConfig(tactile=False, cameras=())
+    with pytest.raises(
+        UserError, match="203.0.113.7 .Cannot assign.*: give an address of this comp"
+    ):
+        Twin(TwinConfig(blind, "fr3", 3, "203.0.113.7", 0, False, Path("/tmp")))
 
 
 def test_web_pages_and_nonsense_change_nothing_at_the_control_port(fr3: RunningTwin) -> None:
