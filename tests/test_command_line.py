@@ -71,6 +71,9 @@ def test_a_bad_value_is_named_as_typed_and_a_mistyped_name_guessed(
     with pytest.raises(SystemExit):
         options("--env.mas", "1", "2")
     assert "Perhaps you meant" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["train-policy", "--data", "a", "--validation", "b", "--steps", "3"])
+    assert re.search(r"you meant:\W+--train.epochs", capsys.readouterr().err)
     with pytest.raises(SystemExit, match=r"no command 'run-polcy'; did you mean run-policy\?$"):
         main(["run-polcy"])
 

@@ -22,6 +22,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import FIXED, LARGEST, RARE, OptionError
 from touchgoal.sim_envs.config import EnvConfig
 
+# Words that no option has, and those from which tyro guesses the option that is meant.
+_MEANT = {"--help-all": "--help", "--steps": "--epochs", "--learning-rate": "--lr"}
 SHOWN = 20  # options that --help shows; --help-all shows all of them
 
 
@@ -42,7 +44,7 @@ def parse(
     _refuse_empty_values(arguments)
     description = re.sub(r"(?<=\S)\n(?=\S)", " ", description)  # tyro does so before letters alone
     short = not {"--help", "-h"}.isdisjoint(arguments)  # tyro does not accept what it hides
-    typed = ["--help" if a == "--help-all" else a for a in arguments]
+    typed = [_MEANT.get(a, a) for a in arguments]
     env = envs[_task(typed, envs)] if envs else None
     hidden_of = {name: _hidden(kind, env) for name, kind in members(config_type)}
     hidden = set().union(*hidden_of.values()) if short else set()
