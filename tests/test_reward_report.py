@@ -21,6 +21,7 @@ from toy_towers import PaintTowers
 from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.store import EpisodeWriter
+from touchgoal.launch.__main__ import main
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import Bank, OwnFrame
 from touchgoal.rewards.measure import Measurement, embed_here, write_skipped
@@ -129,6 +130,28 @@ def test_videos_are_found_by_their_names(tmp_path: Path, monkeypatch: pytest.Mon
     assert (one.camera, one.sides) == (WRIST, (TACTILE_LEFT,))
     line = write_skipped(source.skipped, 5, tmp_path)
     assert line.startswith("2 of 5 skipped") and "c," in (tmp_path / "skipped.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "a.mp4 is no readable video .*: re-encode it"),
+        (["--encoder", "gelsight_mini"], "or name the video of a fingertip a_tactile_left.mp4"),
+        (["--goal", "image:no.png"], "no.png"),
+    ],
+)
+def test_a_mistake_comes_without_a_notice_before_it(
+    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    path = tmp_path / "a.mp4"
+    write_video(path, EPISODE.frames[FRONT], 25)
+    if not options:  # the file opens, and no frame of it decodes
+        data = path.read_bytes()
+        begin, end = data.index(b"mdat") + 4, data.index(b"moov")
+        path.write_bytes(data[:begin] + bytes(end - begin) + data[end:])
+    with pytest.raises(SystemExit, match=message):
+        main(["reward-curves", str(path), *options, "--out", str(tmp_path / "out")])
+    assert not capsys.readouterr().out
 
 
 def test_no_failure_is_measured_to_its_own_end(episodes: Path, tmp_path: Path) -> None:
