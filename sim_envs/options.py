@@ -2,10 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
-from difflib import get_close_matches
 from typing import Any, TypeVar
 
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import unknown_name
 
 Config = TypeVar("Config")
 
@@ -24,9 +23,7 @@ def with_options(config: Config, options: Mapping[str, Any]) -> Config:
     changes = {}
     for name, value in options.items():
         if name not in names:
-            close = get_close_matches(name, names, 1)
-            hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}"
-            raise UserError(f"{type(config).__name__} has no option {name!r}; {hint}")
+            raise unknown_name(f"option of {type(config).__name__}", name, names)
         current = getattr(config, name)
         nested = is_dataclass(current) and isinstance(value, Mapping)
         changes[name] = with_options(current, value) if nested else value

@@ -93,7 +93,7 @@ def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
     limits = cell_limits(read_cell_file(path))
     assert limits.force == 25 and limits.fingertips.lower[2] == 0.1
     path.write_text(json.dumps(table | {"safty": {"force": 25}}))
-    with pytest.raises(UserError, match="cell.json: safty is unknown: did you mean safety?"):
+    with pytest.raises(UserError, match="cell.json: unknown key 'safty': did you mean safety?"):
         read_cell_file(path)
 
 
@@ -117,7 +117,7 @@ TIPS = 'fingertips = { sensor = "digit", left = "simulated", right = "*" }'
             "tool is missing: measure tcp, mass, centre_of_mass and finger_corners",
         ),
         (SIM.replace("cameras.front", "cameras.back"), "cameras.back must be 'front' or 'wrist'"),
-        (SIM.replace("policy =", "polcy ="), "task.polcy is unknown: did you mean policy?"),
+        (SIM.replace("policy =", "polcy ="), "unknown key in task 'polcy': did you mean policy?"),
         (SIM.replace("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),
         (SIM + "safety = { force = nan }", "safety.force must be a finite number, not nan: Ext"),
         (

@@ -100,7 +100,7 @@ def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
         assert [t.episode["object"] for t in result.trials] == ["glass_ball", "bottle_cap"]
     assert Still.episodes == 4  # the file was imported anew, as in a worker
     for name, message in {
-        f"{__file__}:Stil": "has no Stil: did you mean Still",
+        f"{__file__}:Stil": "test_policies.py 'Stil': did you mean Still",
         f"{__file__}:Path": "has no method reset",
         "pick-plac": "did you mean pick-place",
         "bead-maze": "was trained for bead-maze, not for pick-place",

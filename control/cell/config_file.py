@@ -3,13 +3,12 @@
 import json
 import tomllib
 from dataclasses import is_dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, unknown_name
 
 Config = TypeVar("Config")
 
@@ -50,9 +49,7 @@ def first_mistake(error: ValidationError, kind: type) -> str:
     name = ".".join((*where, key))
     if unknown:
         keys = list(_section(kind, where).__pydantic_fields__)
-        near = get_close_matches(key, keys, 1)
-        meant = f"did you mean {near[0]}? " if near else ""
-        return f"{name} is unknown: {meant}There are: {', '.join(keys)}"
+        return str(unknown_name(f"key in {'.'.join(where)}" if where else "key", key, keys))
     meaning = _meaning(kind, first["loc"])
     problem, value = first["type"], first["input"]
     if isinstance(first["loc"][-1], int) and problem == "missing":

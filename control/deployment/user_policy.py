@@ -12,7 +12,6 @@ import inspect
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from traceback import walk_tb
@@ -25,7 +24,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.features import Observation, read_only
 from touchgoal.control.interfaces import Planner, Policy
 from touchgoal.control.policy_server.policy import ServedPolicy
-from touchgoal.runtime.errors import RefusedError, UserError
+from touchgoal.runtime.errors import RefusedError, UserError, unknown_name
 
 # Beginnings of files that are not the user's.
 _NOT_THEIRS = str(Path(__file__).parents[2]), str(Path(importlib.__file__).parent), "<frozen"
@@ -156,9 +155,8 @@ def _import(name: str) -> Any:
     module = _import_file(Path(place)) if place.endswith(".py") else _import_module(place)
     found = getattr(module, attribute, None)
     if found is None:
-        close = get_close_matches(attribute, vars(module), 1)
-        guess = f": did you mean {close[0]}?" if close else ""
-        raise UserError(f"{place} has no {attribute}{guess}")
+        classes = [key for key, value in vars(module).items() if isinstance(value, type)]
+        raise unknown_name(f"policy in {place}", attribute, classes)
     return found
 
 
