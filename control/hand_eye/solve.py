@@ -1,10 +1,9 @@
 """Hand-eye calibration: a camera's pose and lens from views of a board and the arm's poses.
 
-A first estimate by the closed form of Park and Martin ("Robot sensor calibration: solving AX = XB on the
-Euclidean group", IEEE Transactions on Robotics and Automation 10(5), 1994; OpenCV 5 has no
-calibrateHandEye) is refined by least squares on the reprojection error. That also uses the arm's
-motion to measure the lens. Transforms are 4 x 4, `T_a_b` maps points of b to a; the camera's frame is OpenCV's: x
-right, y down, z ahead.
+Zhang's method gives the lens, the closed form of Park and Martin the pose ("Robot sensor calibration:
+solving AX = XB on the Euclidean group", IEEE Transactions on Robotics and Automation 10(5), 1994;
+OpenCV 5 has no calibrateHandEye); `bundle.py` refines both. Each view is left out in turn: by how much
+the others miss it, and by how much the result changes (jackknife), say how far to trust the result.
 """
 
 from collections.abc import Sequence
@@ -14,41 +13,28 @@ from itertools import combinations
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
 from touchgoal.control.hand_eye.board import BoardView
-from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
+from touchgoal.control.hand_eye.bundle import (
+    Bundle,
+    Estimate,
+    Lens,
+    Transform,
+    inverse,
+    transform,
+)
+from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.runtime.errors import UserError
 
-Transform = Float[np.ndarray, "4 4"]
 MIN_VIEWS = 6
 _MOST_UNSURE = 0.01, np.radians(1.0)  # m, rad of standard error beyond which a result is refused
+_MOST_OFF = 0.01  # m by which the others may miss a view
+_SQUARE_OFF = 0.01  # share by which squares may differ from what is given
+_LEAST_NOISE = 0.05  # px, of a corner
 _TOO_ALIKE = (
     "the views do not fix the camera: turn the board or the hand by 20 degrees and more about two axes, and "
     "change the distance"
 )
-
-
-@dataclass(frozen=True)
-class Lens:
-    """A pinhole camera with radial distortion (OpenCV's k1, k2)."""
-
-    fx: float  # focal lengths, px
-    fy: float
-    cx: float  # principal point, px
-    cy: float
-    k1: float
-    k2: float
-
-    @property
-    def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """The camera matrix."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
-
-    @property
-    def distortion(self) -> Float[np.ndarray, "5"]:
-        """OpenCV's coefficients."""
-        return np.array([self.k1, self.k2, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -58,12 +44,15 @@ class HandEye:
     pose: Transform  # of the camera: in the hand's frame (wrist) or the base's (front)
     lens: Lens
     pixel_error: float  # root mean square reprojection error, px
-    # Difference between where each view and where the arm and the calibration place the board.
-    position_errors: Float[np.ndarray, " n"]  # m
+    # Difference between where each view and where the arm and the other views place the board.
+    position_errors: Float[np.ndarray, " n"]  # m, in its middle
     rotation_errors: Float[np.ndarray, " n"]  # rad
-    # Standard errors of the pose, if pixel errors are independent.
+    # Standard errors of the pose, by jackknife over views.
     position_error: float  # m
     rotation_error: float  # rad
+    square_scale: float  # side of the board's squares by the views, over the given one
+    square_scale_error: float  # its standard error
+    closed_form: Transform  # the pose by Park and Martin's method
 
 
 def calibrate_hand_eye(
@@ -74,7 +63,8 @@ def calibrate_hand_eye(
 ) -> HandEye:
     """Calibrate a camera on the hand that sees a resting board, or one at rest that sees a board in the hand.
 
-    UserError: too few views, or views that do not fix the camera.
+    UserError: too few views, views that do not fix the camera, squares other than the given ones, or a
+    view that contradicts the others.
 
     Args:
         views: Corners seen in each view.
@@ -83,64 +73,74 @@ def calibrate_hand_eye(
     """
     if len(views) < MIN_VIEWS:
         raise UserError(f"{len(views)} views show the board, {MIN_VIEWS} are needed, 15 are good")
+    lens, seen, noise = _calibrate_lens(views, image_size)
     # The camera sees the board at inv(X) M Y: X the camera's pose, Y the board's in the other frame.
-    motions = [_inverse(pose) if on_hand else pose for pose in hand_poses]
-    lens, seen = _calibrate_lens(views, image_size)
+    motions = [inverse(pose) if on_hand else pose for pose in hand_poses]
     camera = _park_martin(motions, seen)
-    board = _inverse(motions[0]) @ camera @ seen[0]
-
-    def split(parameters: np.ndarray) -> tuple[Lens, Transform, Transform]:
-        own = Lens(*(float(value) for value in parameters[:6] * scale))
-        return own, camera @ _transform(parameters[6:12]), board @ _transform(parameters[12:])
-
-    def residuals(parameters: np.ndarray) -> np.ndarray:
-        own, X, Y = split(parameters)
-        back = _inverse(X)
-        return np.concatenate(
-            [
-                (_project(view.points, back @ M @ Y, own) - view.pixels).ravel()
-                for view, M in zip(views, motions, strict=True)
-            ]
-        )
-
-    scale = np.array([lens.fx, lens.fy, lens.fx, lens.fy, 1.0, 1.0])
-    start = np.array([lens.fx, lens.fy, lens.cx, lens.cy, lens.k1, lens.k2]) / scale
-    fit = least_squares(residuals, np.concatenate([start, np.zeros(12)]), x_scale="jac")
-    lens, camera_pose, board_pose = split(fit.x)
-    position, rotation = _standard_errors(fit.jac, fit.fun)
-    seen = [_board_pose(view, lens) for view in views]
-    expected = [_inverse(camera_pose) @ M @ board_pose for M in motions]
-    off = [_inverse(a) @ b for a, b in zip(expected, seen, strict=True)]
-    return HandEye(
-        pose=camera_pose,
-        lens=lens,
-        pixel_error=float(np.sqrt(2 * np.mean(fit.fun**2))),
-        position_errors=np.array([np.linalg.norm(T[:3, 3]) for T in off]),
-        rotation_errors=np.array([np.linalg.norm(rotation_vector(T[:3, :3])) for T in off]),
-        position_error=position,
-        rotation_error=rotation,
+    start = Estimate(lens, camera, inverse(motions[0]) @ camera @ seen[0])
+    try:
+        best, without, pixel_error = Bundle(views, hand_poses, on_hand, start, noise).fit()
+    except np.linalg.LinAlgError as error:
+        raise UserError(_TOO_ALIKE) from error
+    turns, shifts = _differences([inverse(best.camera) @ other.camera for other in without])
+    missed = zip(views, hand_poses, without, strict=True)
+    off = [_missed(view, other.board_seen(hand, on_hand), other) for view, hand, other in missed]
+    rotation_errors, position_errors = (np.linalg.norm(part, axis=1) for part in _differences(off))
+    result = HandEye(
+        pose=best.camera,
+        lens=best.lens,
+        pixel_error=pixel_error,
+        position_errors=position_errors,
+        rotation_errors=rotation_errors,
+        position_error=_jackknife(shifts),
+        rotation_error=_jackknife(turns),
+        square_scale=best.scale,
+        square_scale_error=_jackknife(np.array([[other.scale] for other in without])),
+        closed_form=camera,
     )
+    _require_sound(result)
+    return result
+
+
+def _require_sound(result: HandEye) -> None:
+    """Raise UserError for a result that the views do not bear out."""
+    if result.position_error > _MOST_UNSURE[0] or result.rotation_error > _MOST_UNSURE[1]:
+        raise UserError(_TOO_ALIKE)
+    scale, error = result.square_scale, result.square_scale_error
+    if abs(scale - 1) > max(_SQUARE_OFF, 3 * error):
+        raise UserError(
+            f"the views show squares of {scale:.3f} times the given side (standard error {error:.3f}): "
+            "measure the printed board over all its squares and correct --square-mm"
+        )
+    worst, mm = int(result.position_errors.argmax()), 1e3 * result.position_errors
+    if mm[worst] > 1e3 * _MOST_OFF:
+        raise UserError(
+            f"view {worst + 1} is {mm[worst]:.0f} mm from where the others place the board "
+            f"({mm.mean():.1f} mm on average): fix board and camera, hold the arm still, and take the "
+            "views anew"
+        )
 
 
 def _calibrate_lens(
     views: Sequence[BoardView], image_size: tuple[int, int]
-) -> tuple[Lens, list[Transform]]:
-    """Return the lens and the board's pose in each view by Zhang's method, without the arm."""
+) -> tuple[Lens, list[Transform], float]:
+    """Return lens, board poses and pixel noise (px on each axis) by Zhang's method, without the arm."""
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    _, K, distortion, turns, shifts = cv2.calibrateCamera(
+    distance, K, distortion, turns, shifts = cv2.calibrateCamera(
         points, pixels, image_size, None, None, flags=flags
     )  # pyright: ignore[reportCallIssue, reportArgumentType]
     k1, k2 = np.ravel(distortion)[:2]
     lens = Lens(*(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2)))
-    return lens, [_transform(np.append(r, t)) for r, t in zip(turns, shifts, strict=True)]
+    seen = [transform(np.append(r, t)) for r, t in zip(turns, shifts, strict=True)]
+    return lens, seen, max(_LEAST_NOISE, float(distance) / np.sqrt(2))
 
 
 def _park_martin(motions: Sequence[Transform], seen: Sequence[Transform]) -> Transform:
     """Return X of A X = X B for all pairs of views."""
     A, B = (
-        [first @ _inverse(second) for first, second in combinations(poses, 2)]
+        [first @ inverse(second) for first, second in combinations(poses, 2)]
         for poses in (motions, seen)
     )
     a, b = (np.array([rotation_vector(T[:3, :3]) for T in pairs]) for pairs in (A, B))
@@ -155,45 +155,24 @@ def _park_martin(motions: Sequence[Transform], seen: Sequence[Transform]) -> Tra
     return X
 
 
-def _standard_errors(
-    jacobian: Float[np.ndarray, "m p"], residuals: Float[np.ndarray, " m"]
-) -> tuple[float, float]:
-    """Return the standard errors of the camera's position (m) and orientation (rad); UserError if large."""
-    variance = residuals @ residuals / (residuals.size - jacobian.shape[1])
-    try:
-        covariance = variance * np.linalg.inv(jacobian.T @ jacobian)
-    except np.linalg.LinAlgError as error:
-        raise UserError(_TOO_ALIKE) from error
-    spread = np.sqrt(np.abs(np.diag(covariance)[6:12]))
-    position, rotation = float(np.linalg.norm(spread[3:])), float(np.linalg.norm(spread[:3]))
-    if position > _MOST_UNSURE[0] or rotation > _MOST_UNSURE[1]:
-        raise UserError(_TOO_ALIKE)
-    return position, rotation
+def _missed(view: BoardView, expected: Transform, estimate: Estimate) -> Transform:
+    """Return the board's pose in a view, in the frame of the expected one's middle."""
+    middle = np.eye(4)
+    middle[:3, 3] = estimate.scale * view.points.mean(axis=0)
+    points = estimate.scale * view.points - middle[:3, 3]
+    lens = estimate.lens
+    _, turn, shift = cv2.solvePnP(points, view.pixels, lens.matrix, lens.distortion)
+    return inverse(expected @ middle) @ transform(np.append(turn, shift))
 
 
-def _board_pose(view: BoardView, lens: Lens) -> Transform:
-    _, turn, shift = cv2.solvePnP(view.points, view.pixels, lens.matrix, lens.distortion)
-    return _transform(np.append(turn, shift))
+def _differences(
+    changes: Sequence[Transform],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Return rotation vectors (rad) and shifts (m) of transforms."""
+    turns = [rotation_vector(T[:3, :3]) for T in changes]
+    return np.array(turns), np.array([T[:3, 3] for T in changes])
 
 
-def _project(
-    points: Float[np.ndarray, "k 3"], T_camera_board: Transform, lens: Lens
-) -> Float[np.ndarray, "k 2"]:
-    x, y, z = (points @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]).T
-    x, y = x / z, y / z
-    r2 = x * x + y * y
-    stretch = 1 + r2 * (lens.k1 + lens.k2 * r2)
-    return np.stack([lens.fx * stretch * x + lens.cx, lens.fy * stretch * y + lens.cy], axis=1)
-
-
-def _transform(change: Float[np.ndarray, "6"]) -> Transform:
-    """Return the transform of a rotation vector (rad), then a shift (m)."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation_matrix(change[:3]), change[3:]
-    return T
-
-
-def _inverse(T: Transform) -> Transform:
-    back = np.eye(4)
-    back[:3, :3], back[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
-    return back
+def _jackknife(without: Float[np.ndarray, "n d"]) -> float:
+    """Return the standard error of a vector by its values without each view."""
+    return float(np.sqrt((len(without) - 1) * np.var(without, axis=0).sum()))
