@@ -175,7 +175,8 @@ def _report(result: "HandEye", config: Config, cell_file: Path, out: Path, rows:
     square, camera = config.square_mm * result.square_scale, config.camera
     print(
         f"left out, each of {mm.size} views is missed by {mm.mean():.2f} mm and {degrees.mean():.3f} degrees on "
-        f"average, by {mm.max():.2f} mm and {degrees.max():.3f} degrees at most; {result.pixel_error:.2f} px\n"
+        f"average, by {mm.max():.2f} mm and {degrees.max():.3f} degrees at most; {result.pixel_error:.2f} px, "
+        f"the arm's poses are off by {1e3 * result.arm_noise:.2f} mm\n"
         f"standard error of the camera: {1e3 * result.position_error:.2f} mm, "
         f"{np.degrees(result.rotation_error):.3f} degrees; the closed form puts it "
         f"{1e3 * np.linalg.norm(closed):.1f} mm away\n"

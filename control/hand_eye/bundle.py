@@ -7,19 +7,21 @@ pixels and arm are weighed by their noise; else the arm's errors would go into t
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
 from touchgoal.control.hand_eye.board import BoardView
 from touchgoal.control.motion.rotations import rotation_matrix
 
 Transform = Float[np.ndarray, "4 4"]
-# Standard deviation of the hand's error in a view on each axis, rad and m: joints that are off by a
-# few 0.01 degrees, and their links.
+# Standard deviation of the hand's error in a view on each axis, rad and m; the views correct its
+# size, down to what is an arm's repeatability.
 _ARM_NOISE = np.array([np.radians(0.1)] * 3 + [5e-4] * 3)
+_LEAST_SHARE, _ROUNDS = 0.1, 2
 _SHARED = 19  # parameters that all views share
 _STEP = 1e-6  # for derivatives
 
@@ -77,18 +79,24 @@ class Bundle:
         """`noise` is the standard deviation of a corner's pixel, px."""
         self._hands, self._on_hand = np.array(hands), on_hand
         self._start, self._noise = start, noise
+        self._arm_share = 1.0  # of _ARM_NOISE
         self._view = np.repeat(np.arange(len(views)), [len(view.points) for view in views])
         self._points = np.concatenate([view.points for view in views])
         self._pixels = np.concatenate([view.pixels for view in views])
 
-    def fit(self) -> tuple[Estimate, list[Estimate], float]:
-        """Return the estimate, that without each view in turn, and the reprojection error (rms, px).
+    def fit(self) -> tuple[Estimate, list[Estimate], float, float]:
+        """Return the estimate, that without each view, reprojection error (rms, px) and arm noise (m).
 
-        Without a view: one step of Newton's method from the whole, numpy's LinAlgError where the
-        others do not fix a parameter.
+        Without a view: one step of Newton's method from the whole. numpy's LinAlgError where the views
+        do not fix a parameter.
         """
-        start = np.zeros(_SHARED + 6 * len(self._hands))
-        fit = least_squares(self._residuals, start, self._jacobian, x_scale="jac")
+        fit = self._solve(np.zeros(_SHARED + 6 * len(self._hands)))
+        for _ in range(_ROUNDS):  # MacKay's update of a prior's variance
+            errors, inverted = fit.x[_SHARED:], np.linalg.inv(fit.jac.T @ fit.jac)
+            determined = errors.size - np.trace(inverted[_SHARED:, _SHARED:])
+            factor = max(np.sqrt(errors @ errors / determined), _LEAST_SHARE / self._arm_share)
+            self._arm_share *= factor
+            fit = self._solve(np.concatenate([fit.x[:_SHARED], errors / factor]))
         J, residuals, owner = fit.jac, fit.fun, np.repeat(self._view, 2)
         H, without = J.T @ J, []
         for i in range(len(self._hands)):
@@ -96,7 +104,12 @@ class Bundle:
             step = np.linalg.solve(H - J[rows].T @ J[rows], J[rows].T @ residuals[rows])
             without.append(self._estimate(fit.x + step))
         squares = (self._noise * residuals[: owner.size]) ** 2
-        return self._estimate(fit.x), without, float(np.sqrt(2 * np.mean(squares)))
+        pixel_error = float(np.sqrt(2 * np.mean(squares)))
+        return self._estimate(fit.x), without, pixel_error, self._arm_share * float(_ARM_NOISE[-1])
+
+    def _solve(self, start: Float[np.ndarray, " p"]) -> OptimizeResult:
+        jacobian: Any = self._jacobian  # scipy's stub knows names of methods alone
+        return least_squares(self._residuals, start, jacobian, x_scale="jac", method="lm")
 
     def _estimate(self, parameters: Float[np.ndarray, " p"]) -> Estimate:
         start = self._start
@@ -113,7 +126,7 @@ class Bundle:
     def _residuals(self, parameters: Float[np.ndarray, " p"]) -> Float[np.ndarray, " r"]:
         """Return the errors of pixels, then of the hand, in standard deviations."""
         estimate, errors = self._estimate(parameters), parameters[_SHARED:]
-        off = errors.reshape(-1, 6) * _ARM_NOISE
+        off = errors.reshape(-1, 6) * self._arm_share * _ARM_NOISE
         moves = np.tile(np.eye(4), (len(off), 1, 1))
         moves[:, :3, :3], moves[:, :3, 3] = Rotation.from_rotvec(off[:, :3]).as_matrix(), off[:, 3:]
         poses = estimate.board_seen(self._hands @ moves, self._on_hand)[self._view]

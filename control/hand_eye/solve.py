@@ -44,6 +44,7 @@ class HandEye:
     pose: Transform  # of the camera: in the hand's frame (wrist) or the base's (front)
     lens: Lens
     pixel_error: float  # root mean square reprojection error, px
+    arm_noise: float  # m by which the hand's position is off in a view, on each axis
     # Difference between where each view and where the arm and the other views place the board.
     position_errors: Float[np.ndarray, " n"]  # m, in its middle
     rotation_errors: Float[np.ndarray, " n"]  # rad
@@ -79,7 +80,9 @@ def calibrate_hand_eye(
     camera = _park_martin(motions, seen)
     start = Estimate(lens, camera, inverse(motions[0]) @ camera @ seen[0])
     try:
-        best, without, pixel_error = Bundle(views, hand_poses, on_hand, start, noise).fit()
+        best, without, pixel_error, arm_noise = Bundle(
+            views, hand_poses, on_hand, start, noise
+        ).fit()
     except np.linalg.LinAlgError as error:
         raise UserError(_TOO_ALIKE) from error
     turns, shifts = _differences([inverse(best.camera) @ other.camera for other in without])
@@ -90,6 +93,7 @@ def calibrate_hand_eye(
         pose=best.camera,
         lens=best.lens,
         pixel_error=pixel_error,
+        arm_noise=arm_noise,
         position_errors=position_errors,
         rotation_errors=rotation_errors,
         position_error=_jackknife(shifts),
