@@ -237,7 +237,7 @@ def test_moves_over_the_table_are_free_and_one_into_the_arm_itself_is_not() -> N
         (9.5, "tool 9.5 mm .*; the arm's own calibration is not used"),
         (
             10.5,
-            "this package's FR3 has its tool 1[01] mm from .* set the cell file's arm to the model",
+            "tool 10.5 mm .*: is it no FR3[?] set the cell file's arm",
         ),
     ],
 )

@@ -33,9 +33,8 @@ _MIN_RATE_SHARE = 0.8  # share of the camera rate that the cell file states
 # grasp makes 20 and more; real units differ by more than simulated ones (unmeasured here).
 _TOUCHED_COUNTS = 12.0
 _WATCH_SECONDS = 1.0  # s for which cameras are watched
-# m between tool centre points by nominal and by the controller's kinematics: from here it is named, as a
-# UR's own calibration makes 1 to 2 mm; from there it is another arm.
-_CALIBRATED, _OTHER_ARM = 0.001, 0.01
+# mm between tools by nominal and by the controller's kinematics: a UR's own calibration makes 1 to 2
+_CALIBRATED, _OTHER_ARM = 1.0, 10.0
 _MAX_REST_FORCE = 7.5  # N measured at rest above which the arm does not begin
 # Bytes/s: both fingertips and two cameras of 256 x 256 take 17e6 as they come, and at most as much
 # again once the run is saved.
@@ -143,16 +142,13 @@ def _kinematics(connection: CellConnection) -> str:
     if reading.tcp is None:
         return "the controller has none of its own"
     nominal, _ = Kinematics(robot.arm, robot.tool.tcp_offset).forward(reading.q)
-    off = float(np.linalg.norm(reading.tcp - nominal))
+    off = 1e3 * float(np.linalg.norm(reading.tcp - nominal))
+    told = f"tool {off:.1f} mm from where the controller has it"
     if off > _OTHER_ARM:
-        raise UserError(
-            f"this package's {robot.arm.name} has its tool {1e3 * off:.0f} mm from where the controller has it: set "
-            "the cell file's arm to the model that is connected"
-        )
-    calibrated = ""
+        raise UserError(f"{told}: is it no {robot.arm.name}? set the cell file's arm to its model")
     if off >= _CALIBRATED:
-        calibrated = "; the arm's own calibration is not used: heights are off by as much"
-    return f"tool {1e3 * off:.1f} mm from where the controller has it{calibrated}"
+        told += "; the arm's own calibration is not used: heights are off by as much"
+    return told
 
 
 def _limits(cell: CellConfig, safety: ActionFilter) -> str:

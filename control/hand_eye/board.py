@@ -1,7 +1,6 @@
 """A ChArUco board: a chessboard with a marker in each white square, found also where partly hidden."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -44,13 +43,11 @@ class Board:
     def find(self, image: Picture) -> BoardView | None:
         """Return the corners in an RGB image, by the pattern that has more; None if it shows too few."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        found = [self._find(grey, old_pattern) for old_pattern in (False, True)]
-        return max(
-            (view for view in found if view), key=lambda view: len(view.points), default=None
-        )
+        found = [view for old in (False, True) if (view := self._find(grey, old))]
+        return max(found, key=lambda view: len(view.points), default=None)
 
     def _find(self, grey: UInt8[np.ndarray, "h w"], old_pattern: bool) -> BoardView | None:
-        board = self._boards[old_pattern]
+        board = self._board(old_pattern)
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
         if ids is None or len(ids) < _LEAST_CORNERS:
             return None
@@ -63,7 +60,7 @@ class Board:
     def draw(self, pixels_per_metre: float) -> UInt8[np.ndarray, "h w"]:
         """Return the board without a margin, grey values."""
         width, height = (round(side * pixels_per_metre) for side in self.size)
-        return np.asarray(self._boards[False].generateImage((width, height)))
+        return np.asarray(self._board(old_pattern=False).generateImage((width, height)))
 
     def print_to(self, path: Path) -> None:
         """Write a PNG that prints at true scale, with the length to measure on paper below it."""
@@ -82,14 +79,9 @@ class Board:
         with atomic_write(path) as unfinished:
             Image.fromarray(page).save(unfinished, format="PNG", dpi=(_DPI, _DPI))
 
-    @cached_property
-    def _boards(self) -> "dict[bool, cv2.aruco.CharucoBoard]":
-        """The board by whether its pattern is the old one."""
+    def _board(self, old_pattern: bool) -> "cv2.aruco.CharucoBoard":
         dictionary = cv2.aruco.getPredefinedDictionary(_DICTIONARY)
-        boards = {}
-        for old_pattern in (False, True):
-            boards[old_pattern] = board = cv2.aruco.CharucoBoard(
-                (self.columns, self.rows), self.square, _MARKER_SHARE * self.square, dictionary
-            )
-            board.setLegacyPattern(old_pattern)
-        return boards
+        size, marker = (self.columns, self.rows), _MARKER_SHARE * self.square
+        board = cv2.aruco.CharucoBoard(size, self.square, marker, dictionary)
+        board.setLegacyPattern(old_pattern)
+        return board

@@ -7,8 +7,7 @@ import numpy as np
 from touchgoal.control.arrays import Picture
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.hand_eye.board import Board, BoardView
-from touchgoal.control.hand_eye.bundle import Transform
-from touchgoal.control.hand_eye.solve import HandEye, calibrate_hand_eye
+from touchgoal.control.hand_eye.solve import HandEye, Transform, calibrate_hand_eye
 from touchgoal.control.interfaces import Joints
 from touchgoal.control.motion.arm_models import ArmModel
 from touchgoal.control.motion.kinematics import Kinematics

@@ -143,7 +143,7 @@ def find_object(name: str) -> ObjectKind:
 @cache
 def _own_kind(path: str, content: bytes) -> ObjectKind:
     """Return a mesh file's content as an object with the surface of a printed part."""
-    from touchgoal.sim_envs.scene.own_object import read_hull  # loads MuJoCo: not for --help
+    from touchgoal.sim_envs.scene.own_object import read_hull  # loads OpenCV: not for --help
 
     words = Path(path).stem.replace("_", " ").replace("-", " ")
     material = Material(Texture.RIBBED, 15e-6, 0.6e-3, HARD, 0.6, (0.6, 0.6, 0.65, 1.0))

@@ -271,13 +271,10 @@ class UrProgram:
         self.watchdog = 1 / self._double(0) if self._double(0) > 0 else np.inf
 
     def _forward_kinematics(self) -> None:
-        """Answer the pose of a tool, given in the flange's frame, at joint positions."""
-        pose = self.pose(self._goal())
-        R = rotation_matrix(pose[3:])
-        tool = [self._double(i) for i in range(6, 12)]
-        pose[:3] += R @ (np.array(tool[:3]) - [0, 0, UR5E.tool.tcp_offset])
-        pose[3:] = rotation_vector(R @ rotation_matrix(np.array(tool[3:])))
-        self.doubles[:6] = pose.tolist()
+        """Answer the pose of a tool that is shifted from the flange, not turned, at joint positions."""
+        position, R, _ = self.cell.kinematics(self._goal())
+        shift = np.array([self._double(i) for i in (6, 7, 8)]) - [0, 0, UR5E.tool.tcp_offset]
+        self.doubles[:6] = [*position + R @ shift, *rotation_vector(R)]
 
     # Registers.
 
