@@ -41,6 +41,9 @@ class ArmReading:
     fault: str  #: why the arm refuses commands until a person recovers it; empty if it takes them
     stamp: float  #: s, when the controller's clock last advanced
     time: float  #: s, that clock
+    #: m, tool centre point (with this package's tool) by the controller's own kinematics, base frame;
+    #: None where there is no such controller
+    tcp: Float[np.ndarray, "3"] | None = None
 
 
 @dataclass(frozen=True)

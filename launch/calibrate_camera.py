@@ -87,7 +87,7 @@ def _calibrate(config: Config, path: Path, board: "Board") -> None:
         views = list(_views(config, cell, connection, board))
     _save_views(views, out)
     result = calibrate_camera(views, connection.robot.arm, on_hand=config.camera == "wrist")
-    _report(result, config.camera, path, out, rows=views[0].image.shape[0])
+    _report(result, config, path, out, rows=views[0].image.shape[0])
 
 
 def _views(
@@ -102,10 +102,13 @@ def _views(
     for _ in places:
         view = take_view(connection, ft.IMAGE_PREFIX + config.camera, board)
         if view.board is None:
-            print("the board is not seen: this view is left out")
+            print(
+                f"no board of {board.columns} x {board.rows} squares is seen: this view is left out"
+            )
             continue
         count += 1
-        print(f"view {count}: {len(view.board.points)} corners", flush=True)
+        old = " (a board drawn as before OpenCV 4.6)" if view.board.old_pattern else ""
+        print(f"view {count}: {len(view.board.points)} corners{old}", flush=True)
         yield view
 
 
@@ -158,7 +161,7 @@ def _save_views(views: "list[View]", out: Path) -> None:
     write_json(out / "joints.json", [view.q.tolist() for view in views])
 
 
-def _report(result: "HandEye", camera: str, cell_file: Path, out: Path, rows: int) -> None:
+def _report(result: "HandEye", config: Config, cell_file: Path, out: Path, rows: int) -> None:
     from dataclasses import asdict
 
     import numpy as np
@@ -168,18 +171,24 @@ def _report(result: "HandEye", camera: str, cell_file: Path, out: Path, rows: in
     from touchgoal.runtime.json_file import write_json
 
     mm, degrees = 1e3 * result.position_errors, np.degrees(result.rotation_errors)
+    closed = result.closed_form[:3, 3] - result.pose[:3, 3]
+    square, camera = config.square_mm * result.square_scale, config.camera
     print(
-        f"residuals of {mm.size} views: {mm.mean():.2f} mm and {degrees.mean():.3f} degrees on average, "
-        f"{mm.max():.2f} mm and {degrees.max():.3f} degrees at most, {result.pixel_error:.2f} px\n"
+        f"left out, each of {mm.size} views is missed by {mm.mean():.2f} mm and {degrees.mean():.3f} degrees on "
+        f"average, by {mm.max():.2f} mm and {degrees.max():.3f} degrees at most; {result.pixel_error:.2f} px, "
+        f"the arm's poses are off by {1e3 * result.arm_noise:.2f} mm\n"
         f"standard error of the camera: {1e3 * result.position_error:.2f} mm, "
-        f"{np.degrees(result.rotation_error):.3f} degrees"
+        f"{np.degrees(result.rotation_error):.3f} degrees; the closed form puts it "
+        f"{1e3 * np.linalg.norm(closed):.1f} mm away\n"
+        f"squares of the board: {square:.2f} mm by the views (standard error "
+        f"{config.square_mm * result.square_scale_error:.2f}), {config.square_mm:g} mm given"
     )
     pose = [*result.pose[:3, 3], *quaternion(result.pose[:3, :3])]
     values = {
         "pose": [round(float(value), 6) for value in pose],
         "fovy": round(float(np.degrees(2 * np.arctan(rows / 2 / result.lens.fy))), 3),
     }
-    errors = {"residual_mm": mm.tolist(), "residual_degrees": degrees.tolist()}
+    errors = {"left_out_mm": mm.tolist(), "left_out_degrees": degrees.tolist(), "square_mm": square}
     write_json(out / "camera.json", {"camera": camera, **values, **asdict(result.lens), **errors})
     write_camera(cell_file, camera, values)
     print(f"{camera_lines(values)}\nwritten to {cell_file}, [cameras.{camera}]")

@@ -1,11 +1,18 @@
 """Kinematics against pinocchio and MuJoCo; distances of the arm to itself."""
 
+import re
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from fake_cell import SIM, FakeCell, write_cell_file
 
+from touchgoal.control import features as ft
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.deployment.preflight import preflight
 from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
@@ -17,6 +24,7 @@ from touchgoal.control.motion.self_collision import (
 from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.motion.trajectories import joint_move
 from touchgoal.control.safety import limits as robots
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.scene.build import SceneConfig, build
 
@@ -219,3 +227,27 @@ def test_moves_over_the_table_are_free_and_one_into_the_arm_itself_is_not() -> N
     assert distance.gap(folded[None])[0] < 0
     with pytest.raises(UserError, match="of itself"):
         require_no_self_collision(joint_move(FR3_ARM.home, folded, robot.policy), distance)
+
+
+@pytest.mark.parametrize(
+    ("mm", "told"),
+    [
+        (0.5, "tool 0.5 mm from where the controller has it"),
+        (1.5, "tool 1.5 mm .*; the arm's own calibration is not used"),
+        (9.5, "tool 9.5 mm .*; the arm's own calibration is not used"),
+        (
+            10.5,
+            "tool 10.5 mm .*: is it no FR3[?] set the cell file's arm",
+        ),
+    ],
+)
+def test_the_preflight_names_kinematics_that_differ_from_the_controllers(
+    mm: float, told: str, tmp_path: Path
+) -> None:
+    cell = FakeCell()
+    tcp, _ = Fr3Kinematics().forward(cell.arm.reading.q)
+    cell.arm.reading = replace(cell.arm.reading, tcp=tcp + 1e-3 * mm * np.array([0.6, 0.0, -0.8]))
+    file, safety = write_cell_file(tmp_path, SIM), ActionFilter(robots.FR3, ft.CONTROL_HZ)
+    lines = preflight(read_cell_file(file), cell.connection(), safety, tmp_path, lambda: 0)
+    [line] = [line for line in lines if line.name == "kinematics"]
+    assert line.ok == (mm < 10) and re.fullmatch(told + ".*" * (mm > 1), line.detail or line.remedy)

@@ -15,6 +15,8 @@ from running_twin import RunningTwin, client
 
 from touchgoal.control.arms import franka
 from touchgoal.control.cell.connection import connect_arm
+from touchgoal.control.cell.limits import cell_limits
+from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import UR5E
 from touchgoal.sim_envs.twin.franka.limits import estimate_sent
 
@@ -130,7 +132,7 @@ def test_ur_signs_frames_and_units(ur5e: RunningTwin) -> None:
 
 @pytest.mark.parametrize("name", ["fr3", pytest.param("ur5e", marks=pytest.mark.realtime)])
 def test_drivers_say_what_is_done_to_the_robot(name: str, request: pytest.FixtureRequest) -> None:
-    """And a UR's sensor is zeroed at the start, so that what already presses then is not felt."""
+    """And where its controller has the tool. A UR's sensor is zeroed at the start: it feels only later pushes."""
     twin: RunningTwin = request.getfixturevalue(name)
     twin.begin("reset 3")
     safety = replace(twin.cell.safety, state_timeout=1.0)
@@ -143,3 +145,7 @@ def test_drivers_say_what_is_done_to_the_robot(name: str, request: pytest.Fixtur
         pushed = arm.read()
         twin.ask("nudge 0 0 0 0")
     np.testing.assert_allclose((pushed.wrench - before.wrench)[:3], PUSH, atol=0.5)
+    robot = cell_limits(twin.cell)
+    nominal, _ = Kinematics(robot.arm, robot.tool.tcp_offset).forward(before.q)
+    assert before.tcp is not None
+    np.testing.assert_allclose(before.tcp, nominal, atol=1e-4)

@@ -77,6 +77,8 @@ class FrankaClient(ArmClient):
         self._commanded = state.q_d
         contact = (state.O_T_EE * state.EE_T_K).translation
         tcp, _ = self._kinematics.forward(state.q)
+        flange = state.O_T_EE * state.F_T_EE.inverse  # whatever end effector Desk knows
+        offset = self.config.robot.tool.tcp_offset
         return ArmReading(
             q=state.q,
             velocity=state.dq,
@@ -86,6 +88,7 @@ class FrankaClient(ArmClient):
             fault=self._fault(state),
             stamp=self._stamped(state.time.to_sec()),
             time=state.time.to_sec(),
+            tcp=(flange * self._franky.Affine([0.0, 0.0, offset])).translation,
         )
 
     def _fault(self, state: "franky.RobotState") -> str:

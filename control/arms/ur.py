@@ -14,6 +14,7 @@ from touchgoal.control.arms.streaming import ArmClient, shift_wrench
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.motion.rotations import rotation_matrix
 
 RATE = 125.0  # Hz of servoJ; 20 to 500
 STATE_TIMEOUT = 0.05  # s
@@ -41,6 +42,11 @@ class UrClient(ArmClient):
         self._control.setPayload(robot.tool.mass, list(robot.tool.centre_of_mass))
         if not recover:  # a force that remains after a stop must stay visible
             self._control.zeroFtSensor()
+        # Our tool centre point in the frame of the one that is set at the pendant, whichever that is.
+        q, own = self._receive.getActualQ(), np.array(self._receive.getActualTCPPose())
+        tool = [0.0, 0.0, robot.tool.tcp_offset, 0.0, 0.0, 0.0]
+        ours = np.array(self._control.getForwardKinematics(q, tool)[:3])  # as calibrated
+        self._point = rotation_matrix(own[3:]).T @ (ours - own[:3])
         self._control.setWatchdog(_WATCHDOG)
         self._lookahead = float(np.clip(2 * self.period, *_LOOKAHEAD))
         return self.config.robot.interface
@@ -65,8 +71,8 @@ class UrClient(ArmClient):
         tcp, _ = self._kinematics.forward(q)
         # Forces "acting on the end point of the TCP" (UR about get_tcp_force), about the controller's
         # own TCP, in its base frame, without the payload's weight.
-        wrench = np.array(receive.getActualTCPForce())
-        wrench = shift_wrench(wrench, np.array(receive.getActualTCPPose()[:3]), tcp)
+        wrench, own = np.array(receive.getActualTCPForce()), np.array(receive.getActualTCPPose())
+        wrench = shift_wrench(wrench, own[:3], tcp)
         reading = ArmReading(
             q=q,
             velocity=np.array(receive.getActualQd()),
@@ -75,6 +81,7 @@ class UrClient(ArmClient):
             fault=self._fault(),
             stamp=self._stamped(clock),
             time=clock,
+            tcp=own[:3] + rotation_matrix(own[3:]) @ self._point,
         )
         if self._state is None and not reading.fault:
             self._control.kickWatchdog()

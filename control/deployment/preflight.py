@@ -16,6 +16,7 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.hand import require_empty_hand
 from touchgoal.control.interfaces import Camera, TactileSensor
+from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.control.sensors.exchanged import fingertips_exchanged
@@ -32,6 +33,8 @@ _MIN_RATE_SHARE = 0.8  # share of the camera rate that the cell file states
 # grasp makes 20 and more; real units differ by more than simulated ones (unmeasured here).
 _TOUCHED_COUNTS = 12.0
 _WATCH_SECONDS = 1.0  # s for which cameras are watched
+# mm between tools by nominal and by the controller's kinematics: a UR's own calibration makes 1 to 2
+_CALIBRATED, _OTHER_ARM = 1.0, 10.0
 _MAX_REST_FORCE = 7.5  # N measured at rest above which the arm does not begin
 # Bytes/s: both fingertips and two cameras of 256 x 256 take 17e6 as they come, and at most as much
 # again once the run is saved.
@@ -57,6 +60,7 @@ def preflight(
     checks: list[tuple[str, Callable[[], str]]] = [
         ("client", lambda: check_client(cell)),
         ("arm", lambda: _arm(connection, safety)),
+        ("kinematics", lambda: _kinematics(connection)),
         ("limits", lambda: _limits(cell, safety)),
         ("ceilings", lambda: _ceilings(cell, safety)),
         ("gripper", lambda: _gripper(cell, connection)),
@@ -130,6 +134,21 @@ def _arm(connection: CellConnection, safety: ActionFilter) -> str:
         )
     safety.start(reading.q)
     return f"{connection.robot.arm.name} at {np.round(reading.q, 2).tolist()} rad, {force:.1f} N"
+
+
+def _kinematics(connection: CellConnection) -> str:
+    """Compare the nominal kinematics, which place everything here, with the controller's own."""
+    reading, robot = connection.arm.read(), connection.robot
+    if reading.tcp is None:
+        return "the controller has none of its own"
+    nominal, _ = Kinematics(robot.arm, robot.tool.tcp_offset).forward(reading.q)
+    off = 1e3 * float(np.linalg.norm(reading.tcp - nominal))
+    told = f"tool {off:.1f} mm from where the controller has it"
+    if off > _OTHER_ARM:
+        raise UserError(f"{told}: is it no {robot.arm.name}? set the cell file's arm to its model")
+    if off >= _CALIBRATED:
+        told += "; the arm's own calibration is not used: heights are off by as much"
+    return told
 
 
 def _limits(cell: CellConfig, safety: ActionFilter) -> str:

@@ -1,7 +1,6 @@
 """A ChArUco board: a chessboard with a marker in each white square, found also where partly hidden."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -25,6 +24,7 @@ class BoardView:
 
     points: Float[np.ndarray, "k 3"]  # on the board, m: origin in a corner, z = 0
     pixels: Float[np.ndarray, "k 2"]  # in the image: x, y, px
+    old_pattern: bool = False  # drawn as before OpenCV 4.6, which begins with a white square
 
 
 @dataclass(frozen=True)
@@ -41,21 +41,26 @@ class Board:
         return self.columns * self.square, self.rows * self.square
 
     def find(self, image: Picture) -> BoardView | None:
-        """Return the corners in an RGB image; None if it shows too few."""
+        """Return the corners in an RGB image, by the pattern that has more; None if it shows too few."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        corners, ids, _, _ = cv2.aruco.CharucoDetector(self._board).detectBoard(grey)
+        found = [view for old in (False, True) if (view := self._find(grey, old))]
+        return max(found, key=lambda view: len(view.points), default=None)
+
+    def _find(self, grey: UInt8[np.ndarray, "h w"], old_pattern: bool) -> BoardView | None:
+        board = self._board(old_pattern)
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
         if ids is None or len(ids) < _LEAST_CORNERS:
             return None
-        corners_on_board = np.asarray(self._board.getChessboardCorners(), np.float64)
+        corners_on_board = np.asarray(board.getChessboardCorners(), np.float64)
         points = corners_on_board[np.asarray(ids, np.intp).ravel()]
         if np.linalg.matrix_rank(points - points.mean(axis=0)) < 2:  # all on one line
             return None
-        return BoardView(points, np.reshape(corners, (-1, 2)).astype(np.float64))
+        return BoardView(points, np.reshape(corners, (-1, 2)).astype(np.float64), old_pattern)
 
     def draw(self, pixels_per_metre: float) -> UInt8[np.ndarray, "h w"]:
         """Return the board without a margin, grey values."""
         width, height = (round(side * pixels_per_metre) for side in self.size)
-        return np.asarray(self._board.generateImage((width, height)))
+        return np.asarray(self._board(old_pattern=False).generateImage((width, height)))
 
     def print_to(self, path: Path) -> None:
         """Write a PNG that prints at true scale, with the length to measure on paper below it."""
@@ -74,8 +79,9 @@ class Board:
         with atomic_write(path) as unfinished:
             Image.fromarray(page).save(unfinished, format="PNG", dpi=(_DPI, _DPI))
 
-    @cached_property
-    def _board(self) -> "cv2.aruco.CharucoBoard":
+    def _board(self, old_pattern: bool) -> "cv2.aruco.CharucoBoard":
         dictionary = cv2.aruco.getPredefinedDictionary(_DICTIONARY)
-        size = (self.columns, self.rows)
-        return cv2.aruco.CharucoBoard(size, self.square, _MARKER_SHARE * self.square, dictionary)
+        size, marker = (self.columns, self.rows), _MARKER_SHARE * self.square
+        board = cv2.aruco.CharucoBoard(size, self.square, marker, dictionary)
+        board.setLegacyPattern(old_pattern)
+        return board

@@ -131,7 +131,9 @@ def find_object(name: str) -> ObjectKind:
     UserError: an unknown name, which lists the names, or see `read_hull`.
     """
     if Path(name).suffix.lower() in (".stl", ".obj"):
-        return _own_kind(name)
+        if not Path(name).is_file():
+            raise UserError(f"there is no mesh {name}")
+        return _own_kind(name, Path(name).read_bytes())
     known = CATALOGUE | NEW_KINDS
     if name not in known:
         raise unknown_name("object", name, known)
@@ -139,13 +141,13 @@ def find_object(name: str) -> ObjectKind:
 
 
 @cache
-def _own_kind(path: str) -> ObjectKind:
-    """Return a mesh as an object with the surface of a printed part."""
-    from touchgoal.sim_envs.scene.own_object import read_hull  # loads MuJoCo: not for --help
+def _own_kind(path: str, content: bytes) -> ObjectKind:
+    """Return a mesh file's content as an object with the surface of a printed part."""
+    from touchgoal.sim_envs.scene.own_object import read_hull  # loads OpenCV: not for --help
 
     words = Path(path).stem.replace("_", " ").replace("-", " ")
     material = Material(Texture.RIBBED, 15e-6, 0.6e-3, HARD, 0.6, (0.6, 0.6, 0.65, 1.0))
-    return ObjectKind(path, "mesh", material, (words,), read_hull(Path(path)))
+    return ObjectKind(path, "mesh", material, (words,), read_hull(Path(path), content))
 
 
 def of_same_shape(name: str, among: Sequence[str]) -> str:

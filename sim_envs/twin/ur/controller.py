@@ -302,6 +302,8 @@ class UrController(Service):
         program, cell = self._program, self.cell
         if name.startswith("output_int"):
             return program.ints[int(name.rpartition("_")[2])]
+        if name.startswith("output_double"):
+            return program.doubles[int(name.rpartition("_")[2])]
         if name in _VARIABLES:
             value = _VARIABLES[name](self, program, cell)
             return value.tolist() if isinstance(value, np.ndarray) else value

@@ -162,6 +162,7 @@ class UrProgram:
         self.activity: _JointMove | _LineMove | _Servo | _Stop | None = None  # in progress
         # ints: integer output registers; running: false once the program has ended
         self.ints, self.running = [_READY] + [0] * 47, True
+        self.doubles = [0.0] * 48  # output registers
         self._refused = self._cycles_refused = 0
         self.watchdog = np.inf  # s without a command after which the program ends
         self._executing = self._waiting = self._asynchronous = False
@@ -218,6 +219,7 @@ class UrProgram:
             33: lambda: self._stop(asynchronous=self._int(1) == 1),
             34: lambda: self._stop(asynchronous=self._int(1) == 1),
             35: self._set_watchdog,
+            44: self._forward_kinematics,
             _STOP_SCRIPT: self.end,
         }
         if command in actions:
@@ -267,6 +269,12 @@ class UrProgram:
 
     def _set_watchdog(self) -> None:
         self.watchdog = 1 / self._double(0) if self._double(0) > 0 else np.inf
+
+    def _forward_kinematics(self) -> None:
+        """Answer the pose of a tool that is shifted from the flange, not turned, at joint positions."""
+        position, R, _ = self.cell.kinematics(self._goal())
+        shift = np.array([self._double(i) for i in (6, 7, 8)]) - [0, 0, UR5E.tool.tcp_offset]
+        self.doubles[:6] = [*position + R @ shift, *rotation_vector(R)]
 
     # Registers.
 
