@@ -13,14 +13,14 @@ from numbered_pictures import numbered
 
 from touchgoal.control.arms import driver_process, franka, streaming, ur
 from touchgoal.control.arms.driver_process import DriverProcess
-from touchgoal.control.arms.streaming import ArmClient, ArmConfig
+from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, shift_wrench
 from touchgoal.control.cell import connection
 from touchgoal.control.cell.cell_file import EXAMPLES, read_cell_file
 from touchgoal.control.grippers import robotiq
 from touchgoal.control.grippers.franka_hand import FrankaHandClient
 from touchgoal.control.grippers.hand_commands import HandCommands
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
-from touchgoal.control.interfaces import ArmReading, Frame
+from touchgoal.control.interfaces import ArmReading, DriverError, Frame
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.safety.limits import FR3, UR5E
 from touchgoal.control.sensors import exchanged, fingertip_source, video
@@ -369,3 +369,16 @@ def test_a_band_that_changed_in_16_of_20_pictures_is_watched(value: int, beyond:
 def test_a_fingertips_proportions_are_right_within_3_percent(value: int, beyond: bool) -> None:
     picture = np.zeros((240, value, 3), np.uint8)
     assert bool(complaint(crop_to_sensor, picture, GELSIGHT_MINI, NO_CROP)) == beyond
+
+
+@pytest.mark.parametrize("client", [franka.FrankaClient, ur.UrClient])
+def test_no_controller_is_said(client: type) -> None:
+    robot = FR3 if client is franka.FrankaClient else UR5E
+    with pytest.raises(DriverError, match="FCI|verify the IP"):
+        ArmProcess(client, ArmConfig("127.99.99.99", robot, 20.0, 100.0, 0.5))
+
+
+def test_a_wrench_is_moved_with_its_lever() -> None:
+    down = np.array([0, 0, -10.0, 0, 0, 0])
+    moved = shift_wrench(down, np.array([0.1, 0, 0]), np.zeros(3))
+    np.testing.assert_allclose(moved, [0, 0, -10, 0, 1, 0])
