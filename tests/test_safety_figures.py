@@ -20,7 +20,7 @@ from touchgoal.control.safety.action_filter import (
     SafetyState,
     Watchdogs,
 )
-from touchgoal.control.safety.limits import Box, TaskForces
+from touchgoal.control.safety.limits import Box
 
 FR3, UR5E = ActionFilter(robots.FR3, 20), ActionFilter(robots.UR5E, 20)
 HOME, E = robots.FR3.arm.home, np.eye(7)
@@ -170,7 +170,8 @@ def test_a_tasks_ceilings_stop_the_arm_before_its_reflex(
 
 
 def test_no_task_may_press_harder_than_28_newtons() -> None:
-    ceilings = [TaskForces(force, 1e-3, 1) for force in (18.6, 18.7, 100.0)]
+    own = robots.TASK_FORCES["pick-place"]
+    ceilings = [replace(own, force=force, indentation=1e-3) for force in (18.6, 18.7, 100.0)]
     assert [c.force_ceiling for c in ceilings] == pytest.approx([27.9, 28.0, 28.0])
     assert [c.torque_ceiling for c in ceilings] == pytest.approx([16.74, 16.8, 16.8])
     deepest = {name: forces.indentation_ceiling for name, forces in robots.TASK_FORCES.items()}
