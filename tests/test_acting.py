@@ -2,6 +2,7 @@
 
 import shutil
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -83,7 +84,7 @@ def test_an_actor_refuses_what_it_cannot_do() -> None:
         LearnedPolicy(policy, touch).env_config(PickPlaceConfig(control_hz=10))
 
 
-def test_a_second_of_touch_unlike_the_training_is_refused() -> None:
+def test_a_second_of_touch_unlike_the_training_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     touch = toy_touch_embedder()
     config = replace(TOY, touch_dim=touch.dim, watches_novelty=True, execution_horizon=2)
     windows = toy_dataset(config)
@@ -101,6 +102,26 @@ def test_a_second_of_touch_unlike_the_training_is_refused() -> None:
         actor.act(ticks[18])
     actor.refuses_novelty = False  # as while an expert corrects it
     actor.act(ticks[19])
+    actor.refuses_novelty = True
+    for novelty, refused in ((0.99, False), (1.01, True)):
+        monkeypatch.setattr(policy, "novelty_of", lambda _, found=novelty: found)
+        actor.reset()
+        with pytest.raises(RefusedError) if refused else nullcontext():
+            [actor.act(tick) for tick in ticks]
+
+
+def test_the_wrench_is_that_beyond_the_first_ticks() -> None:
+    """An arm's estimate has a bias of some newtons."""
+    network = toy_network(touch_dim=0, touch="", proprioception=(ft.STATE, ft.WRENCH))
+    first, second = toy_observations(2)
+
+    def plan(before: float, now: float) -> np.ndarray:
+        wrenches = [np.full(6, force, np.float32) for force in (before, now)]
+        ticks = [{**t, ft.WRENCH: w} for t, w in zip((first, second), wrenches, strict=True)]
+        return LearnedPolicy(network, None).plan(ticks)
+
+    np.testing.assert_array_equal(plan(0.0, 2.0), plan(5.0, 7.0))
+    assert not np.array_equal(plan(0.0, 2.0), plan(5.0, 2.0))
 
 
 class SlowPolicy(LearnedPolicy):

@@ -6,7 +6,6 @@ The block that is picked up and placed over the wire: test_documented_commands.p
 import errno
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +14,6 @@ from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
 
 import blocked_packages
 import numpy as np
@@ -130,17 +128,6 @@ def test_a_disk_that_fills_up_costs_one_episode_and_is_said_in_a_line(
     assert "ticks of the control loop" in printed.out and "ended: time is up" in printed.out
     assert "could not be saved" in f"{ended.value.code}{printed.err}"
     assert len(EpisodeSet(tmp_path / "run" / "episodes")) == 1
-
-
-def test_a_longer_run_needs_more_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=0.8e9))
-    codes = []
-    for seconds in (60.0, 0.2):
-        cell = write_cell_file(tmp_path, SIM.replace("seed = 3", f"seed = 3, seconds = {seconds}"))
-        with pytest.raises(SystemExit) as ended:
-            run("deploy", cell, "--execute", "--yes", "--out", tmp_path / f"{seconds:g}")
-        codes.append(ended.value.code)
-    assert "make room for 2.6 GB" in str(codes[0]) and codes[1] == NOT_DONE  # time is up
 
 
 def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:

@@ -18,8 +18,6 @@ from touchgoal.control.interfaces import DriverError
 from touchgoal.control.safety.limits import FR3
 from touchgoal.runtime.errors import UserError
 
-pytestmark = pytest.mark.realtime  # time-outs of children, which must get a core
-
 # A child imports its driver by name, so it stands in a module.
 ODD_DRIVER = """
 import ctypes, os, time
@@ -79,7 +77,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "log"
 
 
-def odd(log: Path, mood: str = "", connect_timeout: float = 10.0) -> DriverProcess:
+def odd(log: Path, mood: str = "", connect_timeout: float = 60.0) -> DriverProcess:
     from odd_driver import Odd  # pyright: ignore[reportMissingImports]
 
     return DriverProcess(Odd, str(log), mood, connect_timeout=connect_timeout)

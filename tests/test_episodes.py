@@ -4,6 +4,7 @@ import io
 import json
 import pickle
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import encode
 from touchgoal.episodes.format.repair import repair, validate
 from touchgoal.episodes.media import read_frames, write_video
+from touchgoal.episodes.overlap import require_disjoint
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
@@ -244,3 +246,25 @@ def test_an_append_rewrites_the_last_file_of_the_episodes_alone(
         EpisodeSet(tmp_path)
     assert repair(tmp_path) and validate(tmp_path) == []
     assert_holds(tmp_path, [0, 1, 2, 3, 4])
+
+
+@pytest.mark.parametrize(
+    ("frames", "shared", "refused"),
+    [
+        (1, 0, 0),
+        (1, 1, 1),
+        (10, 1, 0),
+        (10, 2, 1),
+        (40, 3, 0),
+        (40, 4, 1),
+        (400, 39, 0),
+        (400, 40, 1),
+    ],
+)
+def test_sets_that_share_a_tenth_of_an_episode_are_no_two_sets(
+    frames: int, shared: int, refused: bool
+) -> None:
+    """At least two frames of it; simulated episodes may begin alike."""
+    copy = frozenset(range(-shared, frames - shared))
+    with pytest.raises(UserError, match=f"shares {shared}") if refused else nullcontext():
+        require_disjoint([("a", frozenset(range(-frames, 0)))], [("b", copy)])

@@ -262,6 +262,26 @@ def test_a_pause_at_the_start_is_left_out(tmp_path: Path, capsys: pytest.Capture
     assert trimmed.lengths == (15,) and trimmed.actions.unique().tolist() == [pytest.approx(0.1)]
 
 
+def test_the_wrench_is_learned_beyond_the_first_ticks(tmp_path: Path) -> None:
+    ticks = [
+        {**t, ft.WRENCH: np.full(6, 3.0 + i, np.float32)} for i, t in enumerate(toy_observations(4))
+    ]
+    episodes = EpisodeSet(record_ticks(tmp_path / "set", ticks))
+    config = replace(TOY, touch_dim=0, touch="", proprioception=(ft.STATE, ft.WRENCH))
+    for skip in ([0], [2]):
+        wrench = load_recordings(episodes, [0], config, None, skip=skip).state[:, 15]
+        assert wrench.tolist() == [0.0, 1.0, 2.0, 3.0][skip[0] :]
+
+
+def test_the_average_follows_the_weights_by_the_published_decay() -> None:
+    """1 - (1 + step)^-0.75, at most 0.9999 (diffusion_policy's EMAModel)."""
+    decays = [train_module.ema_decay(step) for step in (0, 15, 80, 200_000, 220_000)]
+    assert decays == pytest.approx([0.0, 0.875, 26 / 27, 0.99989426, 0.9999], abs=1e-8)
+    average, weights = [torch.zeros(1)], [torch.ones(1)]
+    train_module._update_average(average, weights, 15)
+    assert average[0].item() == pytest.approx(0.125)
+
+
 def test_a_width_that_rarely_changes_keeps_its_range() -> None:
     widths = torch.zeros(1001, 2, 1)
     widths[::500] = 0.08

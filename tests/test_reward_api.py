@@ -60,7 +60,9 @@ def test_curve_of_arrays(encoder: TouchEncoder) -> None:
     assert curves.costs.keys() == {"image", "tactile", "text"}
     for name, cost in curves.costs.items():
         assert cost.shape == (12,) and curves.rewards[name] == pytest.approx(-cost)
-        assert curves.potential_rewards(0.9)[name].shape == (12,)
+        discounted = 0.9 ** (1 / curves.fps) * cost[1:]  # a second
+        assert curves.potential_rewards(0.9)[name][1:] == pytest.approx(cost[:-1] - discounted)
+        assert curves.potential_rewards()[name].sum() == pytest.approx(cost[0] - cost[-1])
     for name in ("image", "tactile"):
         assert curves.costs[name][0] > 1e-4 and curves.costs[name][-1] == pytest.approx(0, abs=1e-6)
     third = Reward(3, **both)(images=IMAGES, tactile=TOUCH)

@@ -188,16 +188,6 @@ def test_what_is_stale_holds_then_resumes_or_stops(age: str) -> None:
     assert FR3.filter_action(held, np.full(7, 0.01), reading(held.q, **{age: 1.0})).fault
 
 
-def test_actions_that_are_no_numbers_hold_then_stop() -> None:
-    state = FR3.start(FR3.limits.arm.home)
-    modes = []
-    for _ in range(12):
-        state = FR3.filter_action(state, np.full(7, np.nan), reading(state.q))
-        modes.append(state.mode)
-    assert modes[0] is Mode.HOLD and modes[-1] is Mode.STOP
-    assert state.fault and state.fault.limit is Limit.NOT_A_NUMBER
-
-
 @BOTH_ROBOTS
 def test_no_start_outside(robot: RobotLimits) -> None:
     layer = LAYERS[robot.arm.name]

@@ -205,10 +205,13 @@ def test_the_robotiq_bears_a_garbled_answer_and_says_faults(line: tuple[int, str
     wire = Gripper2F85(device, active=True)
     gripper = Robotiq(RobotiqConfig(port))
     gripper.read()
-    wire.garble = 3
+    wire.garble = 4
     gripper.command(0.0)
     until(lambda: gripper.read().width < 1e-3)
-    assert wire.garble == 0
+    assert wire.garble == 0 and wire.output[4:] == bytes([59, 0])  # 50 mm/s, 20 N
+    wire.fault, before = 0x09, gripper.read()  # it heard nothing for a second
+    until(lambda: gripper.read().stamp > before.stamp + 0.05)
+    assert gripper.read().fault == ""
     wire.fault = 0x0E
     until(lambda: "overcurrent" in gripper.read().fault)
     with pytest.raises(DriverError, match="overcurrent"):
@@ -240,10 +243,22 @@ def test_the_robotiqs_port_raises_driver_errors_alone_and_holds_up_no_command(
     gripper.close()
 
 
+def test_five_answers_missed_in_a_row_lose_the_robotiq(line: tuple[int, str]) -> None:
+    wire = Gripper2F85(line[0], active=True)
+    gripper = Robotiq(RobotiqConfig(line[1]))
+    gripper.read()
+    wire.garble = 5
+    with pytest.raises(DriverError, match="garbled"):
+        until(lambda: gripper.read().width > 1)
+    gripper.close()
+
+
 def test_a_load_cell_whose_controller_restarts_is_heard_again_and_one_old_line_is_not() -> None:
     cell = SerialLoadCell.__new__(SerialLoadCell)
     cell._clock, cell._last, cell._behind = -np.inf, -np.inf, 0
-    taken = [cell._clock_advances(Sample(0.0, float(t))) for t in [*range(100, 120), 50, 120, 121]]
-    assert taken == [True] * 20 + [False, True, True]
+    taken = [
+        cell._clock_advances(Sample(0.0, float(t))) for t in [*range(100, 120), 50, 120, 121, 121]
+    ]
+    assert taken == [True] * 20 + [False, True, True, False]
     again = [cell._clock_advances(Sample(0.0, float(t))) for t in range(30)]
-    assert not any(again[:10]) and all(again[11:])
+    assert again == [False] * 10 + [True] * 20

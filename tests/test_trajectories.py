@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from both_sides import complaint, sides
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -183,3 +184,23 @@ def test_with_commands_lost_the_fingers_stay_in_their_box() -> None:
     q = track(FR3, targets)
     check_within(FR3.interface, q)
     assert outside_box(layer, q[::10]) < 2e-3
+
+
+@sides((0.49e-3, 0.51e-3))
+def test_a_line_that_bends_by_half_a_millimetre_is_refused(value: float, beyond: bool) -> None:
+    class Bent(Fr3Kinematics):
+        def forward_many(self, q: np.ndarray) -> tuple:
+            points, *rest = super().forward_many(q)
+            return points + [0, value, 0], *rest
+
+    arm = Bent()
+    end, R = arm.forward(arm.arm.home)
+    line = arm, arm.arm.home, end + [0, 0, 0.1], R, FR3.interface
+    assert ("passes a singular posture" in complaint(straight_line, *line)) == beyond
+
+
+def test_targets_beyond_the_range_are_cut_to_it() -> None:
+    tracker = Tracker(FR3.interface, FR3.policy.velocity, 0.05)
+    for far, end in ((9.0, FR3.interface.upper), (-9.0, FR3.interface.lower)):
+        state = tracker.set_target(tracker.start(FR3.arm.home), FR3.arm.home + far)
+        np.testing.assert_array_equal(state.targets[-1], end)
