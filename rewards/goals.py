@@ -133,11 +133,11 @@ class EpisodeEnd:
     def __str__(self) -> str:
         return f"episode:{self.root}#{self.index}"
 
-    def read(self, keys: Sequence[str]) -> Episode:
+    def read(self, keys: Sequence[str], also: Sequence[str] = ()) -> Episode:
         """Return the first frames (for the background of touch) and, last, the last frame.
 
-        The simulator's contact and the wrench are added where they are recorded. UserError: no such set, episode or
-        key.
+        The simulator's contact, the wrench and `also` are added where they are recorded. UserError: no
+        such set, episode or key.
         """
         episodes = EpisodeSet(self.root, keys=self.keys)
         if self.index >= len(episodes):
@@ -145,7 +145,8 @@ class EpisodeEnd:
                 f"goal '{self}' does not exist: {self.root} has episodes 0 to {len(episodes) - 1}"
             )
         length = episodes.lengths[self.index]
-        more = [key for key in (TRUTH_CONTACT, WRENCH) if key in episodes.features]
+        wanted = dict.fromkeys((*also, TRUTH_CONTACT, WRENCH))
+        more = [key for key in wanted if key in episodes.features and key not in keys]
         frames = [*range(min(START_FRAMES, length)), length - 1]
         return episodes.read(self.index, [*keys, *more], frames)
 

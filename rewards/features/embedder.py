@@ -234,10 +234,9 @@ class EpisodeEmbedder:
         if isinstance(spec, GoalImage):
             return self.embed_cameras({main: spec.read()})
         if isinstance(spec, EpisodeEnd):
-            seen = [key for key in (*CAMERAS, main) if camera_name(key) in own.features]
-            key = spec, tuple(dict.fromkeys(seen)) or (main,)
+            key = spec, tuple(k for k in CAMERAS if camera_name(k) in own.features)
             if key not in self._goals:
-                frames = spec.read(key[1]).frames
+                frames = spec.read((main,), also=key[1]).frames
                 last = {k: v[-1:] for k, v in frames.items() if is_camera(k)}
                 self._goals[key] = self.embed_cameras(last)
             return self._goals[key]
@@ -275,10 +274,9 @@ class EpisodeEmbedder:
         if isinstance(spec, GoalFile):
             return SuccessfulEnds.load(spec.path)
         seen = [key for key in CAMERAS if camera_name(key) in own.features]
-        keys = dict.fromkeys((*seen, *((self.camera,) if self.camera else ()), *own.sides))
-        return SuccessfulEnds.of(
-            [self.embed_episode(e.read(tuple(keys)), own.fps, str(e)) for e in spec.ends()]
-        )
+        keys = (*((self.camera,) if self.camera else ()), *own.sides)
+        ends = [self.embed_episode(e.read(keys, seen), own.fps, str(e)) for e in spec.ends()]
+        return SuccessfulEnds.of(ends)
 
 
 class FeatureStream:
