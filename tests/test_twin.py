@@ -180,10 +180,10 @@ def test_load_cell_weighs_is_garbled_and_unplugged(fr3: RunningTwin) -> None:
 def test_one_deployment_at_a_time_uses_a_twin(fr3: RunningTwin) -> None:
     fr3.begin("reset 5")
     with lease_twin(fr3.cell.task.twin):
-        before = fr3.ask("truth")["layout"]
+        before = fr3.ask("truth")["layout"]["goal"]
         with pytest.raises(UserError, match="another deploy uses this twin"):
             cell_run.connect(fr3.cell)  # of another seed: it would put the scene back
-        assert fr3.ask("truth")["layout"] == before
+        assert fr3.ask("truth")["layout"]["goal"] == before
     lease_twin(fr3.cell.task.twin).close()
 
 
