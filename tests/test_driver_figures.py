@@ -84,12 +84,12 @@ def client(wall: Wall) -> Client:
 
 def test_a_late_tick_makes_up_for_four_periods(client: Client) -> None:
     client.command(HOME + 0.01 * E[0])
-    client._tracker.step = MagicMock(wraps=client._tracker.step)
+    client._tracker.step = step = MagicMock(wraps=client._tracker.step)
     for periods, steps in ((3, 3), (4, 4), (9, 4)):
-        client._tracker.step.reset_mock()
+        step.reset_mock()
         client.time += 0.005 * periods
         client.tick()
-        assert client._tracker.step.call_count == steps
+        assert step.call_count == steps
 
 
 @pytest.mark.parametrize(
@@ -234,7 +234,7 @@ def test_how_long_a_driver_process_is_waited_for(monkeypatch: Patch) -> None:
     assert pipe.poll.call_args_list == [call(30.0), call(1.5)]
     child.close()
     popen.return_value.wait.assert_called_with(4.0)
-    driver = SimpleNamespace(period=0.005, tick=lambda: None, close=lambda: None)
+    driver = MagicMock(spec=Client, period=0.005)
     pipe.recv.return_value = "tick", (), 1.5
     driver_process._answer(driver, pipe)
     pipe.poll.side_effect = EOFError
@@ -281,7 +281,7 @@ def test_when_and_how_a_hand_is_commanded() -> None:
 @sides((7.9, 8.2))
 def test_a_robotiq_has_eight_seconds_to_activate(wall: Wall, value: float, beyond: bool) -> None:
     gripper = Robotiq.__new__(Robotiq)
-    gripper.config, gripper._write = RobotiqConfig("", activate=True), lambda _: None
+    gripper.config, gripper._write = RobotiqConfig("", activate=True), lambda command: None
     gripper._status = lambda: bytes([0x31 if wall.now > value else 0x11])
     assert ("does not become active" in complaint(gripper._start)) == beyond
 
@@ -301,20 +301,23 @@ def test_how_old_a_picture_may_be(wall: Wall, monkeypatch: Patch) -> None:
     opened.return_value = capture
     capture.read.return_value = capture.retrieve.return_value = True, jpeg
     monkeypatch.setattr(cv2, "VideoCapture", opened)
-    monkeypatch.setattr(video, "LatestValue", MagicMock())
+    monkeypatch.setattr(video, "LatestValue", latest := MagicMock())
     camera = VideoCamera(VideoConfig("http://here", rate=50.0))
-    camera._latest.read.return_value = camera._take()
+    latest.return_value.read.return_value = camera._take()
+
+    def stamp(camera: VideoCamera, now: float) -> float:
+        wall.now = now
+        assert (frame := camera._take())
+        return frame.stamp
+
     for age, late in ((0.059, False), (0.061, True)):
         wall.now = age
         assert bool(camera.problem) == late
-    for seconds, stamp in ((0.49, 0.49), (0.51, 0.0)):
-        wall.now = seconds
-        assert camera._take().stamp == stamp
+    assert [stamp(camera, now) for now in (0.49, 0.51)] == [0.49, 0.0]
     patient = VideoCamera(VideoConfig("http://twin", frozen_after=0.0, frozen_pictures=2))
-    stamps = []
-    for wall.now in (0.51, 0.61, 0.71, 0.81):
-        stamps.append(patient._take().stamp)
+    stamps = [stamp(patient, now) for now in (0.51, 0.61, 0.71, 0.81)]
     assert stamps == [0.51, 0.61, 0.71, 0.51], "the third unchanged picture is old"
+    patient.close()
     capture.grab.return_value = False
     camera._take()
     ways = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC]
