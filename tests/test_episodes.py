@@ -21,12 +21,8 @@ from touchgoal.control.sensors.clip import read_frames
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import encode
 from touchgoal.episodes.format.repair import repair, validate
-<<<<<<< HEAD
-from touchgoal.episodes.media import read_frames, write_video
-from touchgoal.episodes.overlap import require_disjoint
-=======
 from touchgoal.episodes.media import write_video
->>>>>>> 879d52df (One reader of recordings for all commands: turned, timed and coloured as the file says; HDR, alpha and 16 bits are refused, grey is told)
+from touchgoal.episodes.overlap import require_disjoint
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
