@@ -37,7 +37,8 @@ def find_faults(
 ) -> dict[int, str]:
     """Return the first fault of each faulty episode, with its frame.
 
-    Checks these keys, by default all. Touchgoal's own sets are not checked: its writer refuses such
+    Checks these keys, by default all. Surplus frames at the end of a video are no fault: they are told
+    on stderr. Touchgoal's own sets are not checked: its writer refuses such
     episodes, and checksums cover the rest.
     """
     if not episodes.foreign:
@@ -83,8 +84,11 @@ def _video_fault(episodes: EpisodeSet, i: int, key: str) -> str | None:
     stated, left, fps = episodes.video_length(i, key)
     if abs(fps - episodes.fps) > _RATE * episodes.fps:
         return f"{key} is a video of {fps:g} frames per second, the table has {episodes.fps:g}"
-    if stated != length or left < length:
+    if min(stated, left) < length:
         return f"{key} ends at frame {max(min(stated, left), 0)}, the table at frame {length}"
+    if stated > length:
+        surplus = f"{key} has {stated - length} frames more than the table"
+        print(f"episode {i} of {episodes.root}: {surplus}, which are left out", file=sys.stderr)
     return None
 
 

@@ -1,36 +1,25 @@
-"""Video through PyAV, folders of images through OpenCV. Frames are RGB."""
+"""Stored videos of episodes, through PyAV. Frames are RGB."""
 
 import io
-import re
 import tempfile
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
 from fractions import Fraction
-from itertools import islice
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any
 
 import av
-import av.error
 import numpy as np
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
-from touchgoal.episodes.format.other_formats import refuse_other_format
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture
 
 KEY_FRAME_INTERVAL = 2  # frames, so that one frame is found by decoding at most two
 # No B frames: presentation order is decoding order and the first time stamp is exactly 0.
 _SEEKABLE = {"g": str(KEY_FRAME_INTERVAL), "bf": "0", "preset": "veryfast"}
-_DECODED_AT_ONCE = 64  # frames
-PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
-VIDEOS = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".gif"}
-"""Endings of image and of video files that a folder is searched for."""
 
 
 def encode_video(
@@ -141,105 +130,3 @@ def write_video(path: Path, frames: UInt8[np.ndarray, "n h w 3"], fps: float | i
     """
     _encode(frames, fps, "libx264", "yuv420p", {"crf": "18"}, file := io.BytesIO())
     write_file(path, file.getvalue())
-
-
-@dataclass(frozen=True)
-class Clip:
-    """A video file, or a folder of images in natural order (2 before 10), not yet decoded."""
-
-    path: Path
-    length: int  # frames, as the file states them
-    shape: tuple[int, int]  # height and width, px
-    fps: float | None  # frames per second; None for a folder of images
-
-    def chunks(self, frames: int) -> Iterator[UInt8[np.ndarray, "n h w 3"]]:
-        """Decode the frames in order, at most so many at a time.
-
-        UserError: a frame is unreadable, or of another size than the first.
-        """
-        decoded = _folder_frames(self.path) if self.path.is_dir() else _video_frames(self.path)
-        size = None
-        while chunk := list(islice(decoded, frames)):
-            size = size or chunk[0].shape
-            if any(frame.shape != size for frame in chunk):
-                raise UserError(f"{self.path} holds images of different sizes: make them equal")
-            yield np.stack(chunk)
-
-
-def open_clip(path: Path) -> Clip:
-    """Open a video file or a folder of images and count its frames, without decoding them.
-
-    UserError: nothing there, or nothing readable.
-    """
-    if path.is_dir():
-        return Clip(path, len(_image_files(path)), next(_folder_frames(path)).shape[:2], None)
-    if not path.exists():
-        raise UserError(f"{path} does not exist: give a video file or a folder of images")
-    refuse_other_format(path)
-    if next(_video_frames(path), None) is None:  # broken ones are refused before any work
-        raise UserError(f"{path} holds no frame: record it again")
-    with _readable(path), av.open(str(path), "r") as container:
-        if not container.streams.video:
-            raise UserError(f"{path} holds no video stream: give a video file")
-        stream = container.streams.video[0]
-        length = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
-        shape, rate = (stream.height, stream.width), stream.average_rate
-    if not length:
-        raise UserError(f"{path} holds no frame: record it again")
-    return Clip(path, length, shape, float(rate) if rate else None)
-
-
-def read_frames(path: Path) -> tuple[UInt8[np.ndarray, "n h w 3"], float | None]:
-    """Read all frames of a video file or of a folder of images.
-
-    Returns RGB frames, and frames per second (None for a folder). UserError: as `open_clip` and
-    `Clip.chunks`.
-    """
-    clip = open_clip(path)
-    return np.concatenate(list(clip.chunks(_DECODED_AT_ONCE))), clip.fps
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except av.error.FFmpegError as error:
-        raise UserError(f"{path} is no readable video ({error.strerror}): re-encode it") from error
-
-
-def _video_frames(path: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    convert = VideoReformatter()  # one for all frames: half the time of a new one each
-    with _readable(path), av.open(str(path), "r") as container:
-        for frame in container.decode(video=0):
-            yield convert.reformat(frame, format="rgb24").to_ndarray()
-
-
-def _folder_frames(folder: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    for path in _image_files(folder):
-        picture = read_picture(path)
-        if picture is None:
-            raise UserError(f"{path} is no readable image: remove or replace it")
-        yield picture
-
-
-def _image_files(folder: Path) -> list[Path]:
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in PICTURES]
-    if not paths and (folder / "data").is_dir():
-        raise UserError(
-            f"{folder} holds data/ but no meta/info.json; if it is a set of episodes, run: "
-            f"touchgoal repair --fix {folder}"
-        )
-    for path in () if paths else sorted(folder.iterdir()):
-        refuse_other_format(path)
-    if not paths:
-        raise UserError(f"{folder} holds no image ({', '.join(sorted(PICTURES))})")
-    return in_natural_order(paths)
-
-
-def in_natural_order(paths: Iterable[Path]) -> list[Path]:
-    """Sort paths by name, numbers by value: 2 before 10."""
-    return sorted(paths, key=lambda path: _natural_order(path.name))
-
-
-def _natural_order(name: str) -> list[tuple[str, int]]:
-    return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name)]

@@ -9,7 +9,12 @@ from jaxtyping import Bool, Int, UInt8
 from touchgoal.control.arrays import Picture
 from touchgoal.control.features import TACTILE, TACTILE_LEFT, TRUTH_CONTACT, WRIST
 from touchgoal.control.sensors.exchanged import fingertips_exchanged
-from touchgoal.control.tactile.background import Background, local_change
+from touchgoal.control.tactile.background import (
+    SETTLES_WITHIN,
+    Background,
+    local_change,
+    untouched_frames,
+)
 from touchgoal.control.tactile.contact import ContactDetector, threshold_for
 from touchgoal.control.tactile.picture_guard import check_untouched
 from touchgoal.control.tactile.sensor_models import SENSORS
@@ -17,7 +22,6 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
-_BACKGROUND_FRAMES = 5
 _VIEW_FRAMES_BEFORE_CONTACT = 5
 _SAME_SENSOR = (
     1.0  # counts of local change of one sensor between two days; noise of 1 count gives 0.3
@@ -172,8 +176,11 @@ def _exchanged(frames: tuple[Picture, Picture], first: tuple[Picture, Picture]) 
 
 
 def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a fingertip's background, for training and rewards: the median of its first 5 frames."""
-    return np.median(frames[:_BACKGROUND_FRAMES], axis=0).astype(np.uint8)
+    """Return a fingertip's background, for training and rewards: the median of 5 frames.
+
+    They are the first ones in steady light (`untouched_frames`).
+    """
+    return np.median(untouched_frames(frames), axis=0).astype(np.uint8)
 
 
 class ContactStream:
@@ -188,7 +195,7 @@ class ContactStream:
     def update(self, frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, " t"]:
         """Return whether each of the next frames is in contact."""
         if self._detector is None:
-            untouched, background = frames[:_BACKGROUND_FRAMES], touch_background(frames)
+            untouched, background = untouched_frames(frames), touch_background(frames)
             threshold = threshold_for(untouched, background)
             self._detector = ContactDetector(Background(background[None]), threshold)
         return np.array([self._detector.update(frame) for frame in frames], bool)
@@ -201,7 +208,7 @@ def contact_per_frame(frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, 
 
 def _background(episodes: EpisodeSet, i: int, side: int) -> UInt8[np.ndarray, "h w 3"]:
     key = TACTILE[side]
-    first = range(min(_BACKGROUND_FRAMES, episodes.lengths[i]))
+    first = range(min(SETTLES_WITHIN, episodes.lengths[i]))
     return touch_background(episodes.read(i, [key], first).frames[key])
 
 

@@ -1,7 +1,9 @@
 """Image files: reading those of unknown origin, and writing without silent failures."""
 
 import io
+import sys
 import warnings
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -18,7 +20,8 @@ _MOST_PIXELS = 50_000_000  # a small file may unpack to gigabytes
 def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
     """Read the RGB image of a file; None if it is missing or unreadable.
 
-    UserError: it has more than 50 million pixels.
+    A grey image gets three equal channels, which is said on stderr. UserError: it has more than 50
+    million pixels, transparent ones, or more than 8 bits a channel.
     """
     try:
         return decode_picture(path.read_bytes(), str(path))
@@ -33,6 +36,9 @@ def decode_picture(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data)) as picture:  # reads the header alone
                 width, height = picture.size
+                alpha = "A" in picture.mode or "transparency" in picture.info
+                if alpha and width * height <= _MOST_PIXELS:
+                    alpha = np.asarray(picture.convert("RGBA"))[..., 3].min() < 255
         size = f"{width} x {height} pixels" if width * height > _MOST_PIXELS else ""
     except Image.DecompressionBombError:
         size = "far too many pixels"
@@ -41,10 +47,28 @@ def decode_picture(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
     if size:
         raise UserError(f"{name} has {size}: make it smaller than {_MOST_PIXELS / 1e6:.0f} million")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        # Turned as its EXIF orientation says; 16 bits and one channel are kept, to be seen.
+        as_stored = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), as_stored)
     except cv2.error:
         return None
-    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    if image is None:
+        return None
+    if alpha:
+        raise UserError(f"{name} has transparent pixels: save it without an alpha channel")
+    if image.dtype != np.uint8:
+        raise UserError(f"{name} has {8 * image.itemsize} bits a channel: save it with 8")
+    if image.ndim == 2:
+        parent = Path(name).parent
+        _say_grey(name if parent == Path() else str(parent))
+        return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+@cache
+def _say_grey(where: str) -> None:
+    """Say once a folder that its images are grey."""
+    print(f"{where}: grey images are measured as RGB with equal channels", file=sys.stderr)
 
 
 def write_picture(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:

@@ -14,10 +14,13 @@ Frames = dict[str, np.ndarray]
 
 
 def write_lerobot_set(root: Path, episodes: list[Frames], fps: int = 15) -> None:
-    """Write episodes; arrays (n, h, w, 3) become videos, others columns. `timestamp` may be given."""
-    lengths = [len(next(iter(frames.values()))) for frames in episodes]
-    ends = np.cumsum(lengths)
+    """Write episodes; arrays (n, h, w, 3) become videos, others columns. `timestamp` may be given.
+
+    Videos may be longer than the columns.
+    """
     videos = [key for key, values in episodes[0].items() if values.ndim == 4]
+    lengths = [len(frames["action"]) for frames in episodes]
+    ends, ends_shown = np.cumsum(lengths), np.cumsum([len(e[videos[0]]) for e in episodes])
     tables = []
     for i, frames in enumerate(episodes):
         n = lengths[i]
@@ -39,7 +42,10 @@ def write_lerobot_set(root: Path, episodes: list[Frames], fps: int = 15) -> None
         write_video(
             root / set_files.video_path(key, 0), np.concatenate([e[key] for e in episodes]), fps
         )
-    rows = [_row(i, lengths[i], int(ends[i]), videos, fps) for i in range(len(episodes))]
+    times = np.stack([np.append(0, ends_shown[:-1]), ends_shown], 1) / fps
+    rows = [
+        _row(i, lengths[i], int(ends[i]), videos, times[i].tolist()) for i in range(len(episodes))
+    ]
     for file, part in enumerate((rows[:1], rows[1:])):  # as after `resume`
         path = root / set_files.EPISODES.replace("file-000", f"file-00{file}")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -51,7 +57,7 @@ def write_lerobot_set(root: Path, episodes: list[Frames], fps: int = 15) -> None
     write_json(root / set_files.INFO, info | {f"total_{name}": n for name, n in totals.items()})
 
 
-def _row(i: int, length: int, end: int, videos: list[str], fps: int) -> dict:
+def _row(i: int, length: int, end: int, videos: list[str], shown: list[float]) -> dict:
     places = {"chunk_index": 0, "file_index": 0}
     row = {
         "episode_index": i,
@@ -61,7 +67,7 @@ def _row(i: int, length: int, end: int, videos: list[str], fps: int) -> dict:
         "dataset_to_index": end,
         **{f"data/{name}": value for name, value in places.items()},
     }
-    times = {"from_timestamp": (end - length) / fps, "to_timestamp": end / fps}
+    times = dict(zip(("from_timestamp", "to_timestamp"), shown, strict=True))
     for key in videos:
         row |= {f"videos/{key}/{name}": value for name, value in (places | times).items()}
     return row

@@ -13,10 +13,10 @@ from toy_episodes import record
 from benchmarks.papers import mixed_demonstrations, reward_use
 from benchmarks.papers.reward_quality import benchmark, recording
 from touchgoal.control import features as ft
+from touchgoal.control.sensors.clip import read_frames
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS
-from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch import demo
 from touchgoal.launch.__main__ import COMMANDS, usage

@@ -17,10 +17,11 @@ from PIL import Image
 from toy_episodes import FPS, assert_holds, make_episode, moving_blob, record
 
 from touchgoal.control import features as ft
+from touchgoal.control.sensors.clip import read_frames
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import encode
 from touchgoal.episodes.format.repair import repair, validate
-from touchgoal.episodes.media import read_frames, write_video
+from touchgoal.episodes.media import write_video
 from touchgoal.episodes.overlap import require_disjoint
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter

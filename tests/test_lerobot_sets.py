@@ -108,6 +108,21 @@ def test_a_video_that_is_too_short_or_of_another_rate(foreign: Path) -> None:
     assert "30 frames per second" in find_faults(EpisodeSet(foreign), [0], [TOP])[0]
 
 
+def test_surplus_frames_at_the_end_of_a_video_are_told_and_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded = [toy_frames(i, 24) for i in range(3)]
+    for key in ("observation.state", "action"):
+        recorded[1][key] = recorded[1][key][:16]
+    write_lerobot_set(tmp_path, recorded)
+    episodes = EpisodeSet(tmp_path)
+    assert leave_out_faulty(episodes, range(3), [TOP]) == [0, 1, 2] and episodes.lengths[1] == 16
+    assert f"episode 1 of {tmp_path}: {TOP} has 8 frames more" in capsys.readouterr().err
+    for i, n in enumerate(episodes.lengths):  # those after it are read from their own start
+        off = episodes.read(i, [TOP]).frames[TOP].astype(int) - recorded[i][TOP][:n]
+        assert np.abs(off).mean() < 4
+
+
 def test_keys_rename_features_of_a_set_and_of_goals(foreign: Path) -> None:
     keys = parse_keys([f"{TOP}={ft.FRONT}"])
     assert {TOP, ft.FRONT} & EpisodeSet(foreign, keys=keys).features.keys() == {ft.FRONT}

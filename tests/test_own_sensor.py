@@ -16,6 +16,7 @@ from touchgoal.control.calibration.press_set import read_presses
 from touchgoal.control.calibration.sensor_check import check_sensor
 from touchgoal.control.sensors.fingertip_source import open_frames, recorded_frames
 from touchgoal.control.sensors.live_picture import LivePicture
+from touchgoal.control.tactile.background import untouched_frames
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.gel_wear import find_wear
 from touchgoal.control.tactile.sensor_calibration import load, shade
@@ -24,6 +25,7 @@ from touchgoal.control.tactile.sensor_models import (
     GELSIGHT_MINI_MARKERS,
     find_sensor,
 )
+from touchgoal.episodes.touches import touch_background
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import NO_RANDOMIZATION
@@ -103,7 +105,7 @@ def test_a_video_and_a_folder_give_every_frame(session: list[np.ndarray], tmp_pa
     read = list(recorded_frames(path, GELSIGHT_MINI))
     assert len(read) == 40
     assert np.abs(read[0].astype(int) - session[0]).mean() < 4
-    with pytest.raises(UserError, match="no pictures"):
+    with pytest.raises(UserError, match="does not exist"):
         list(recorded_frames(tmp_path / "nothing", GELSIGHT_MINI))
 
 
@@ -134,6 +136,25 @@ def balls() -> list[np.ndarray]:
     clean = [shade(calibration, surface) for surface in ([flat] * 12 + pressed + [flat] * 3)]
     noisy = [picture + rng.normal(size=picture.shape) for picture in clean]
     return [picture.round().clip(0, 255).astype(np.uint8) for picture in noisy]
+
+
+def test_the_start_of_a_clip_is_no_untouched_gel_by_itself(
+    balls: list[np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Dark first frames are named and left out; a clip pressed in all its frames is told as that."""
+    for pressed in balls[12:15]:
+        with pytest.raises(UserError, match="the recording begins in touch"):
+            check_sensor([pressed] * 20, GELSIGHT_MINI)
+    dark = [(0.5 * frame).astype(np.uint8) for frame in balls[:5]]
+    settling = [*dark, *balls]
+    check = check_sensor(settling, GELSIGHT_MINI)
+    assert "frames 0 to 4 are left out" in capsys.readouterr().err
+    assert (check.frames, check.touching) == (18, 3) and not check.drift_from_file.large
+    np.testing.assert_array_equal(
+        touch_background(np.stack(settling)), touch_background(np.stack(balls))
+    )
+    early = np.stack([*balls[:2], *[balls[13]] * 16])  # a touch is no settling exposure
+    np.testing.assert_array_equal(untouched_frames(early), early[:5])
 
 
 def test_a_sensor_check_reads_noise_ball_and_contact(balls: list[np.ndarray]) -> None:

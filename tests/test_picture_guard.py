@@ -15,7 +15,12 @@ from touchgoal.control.calibration.ball import press_surface
 from touchgoal.control.features import TACTILE
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.sensors.tactile_camera import NO_CROP, TactileCamera
-from touchgoal.control.tactile.picture_guard import check_presses, check_untouched, find_seam
+from touchgoal.control.tactile.picture_guard import (
+    check_presses,
+    check_unpressed,
+    check_untouched,
+    find_seam,
+)
 from touchgoal.control.tactile.sensor_calibration import load, save, shade
 from touchgoal.control.tactile.sensor_models import (
     DIGIT,
@@ -94,6 +99,7 @@ def test_other_sensors_of_the_model_pass() -> None:
             for x, y in rng.integers(20, 220, (6, 2)):
                 cv2.circle(picture, (int(x), int(y)), 3, (30, 25, 30), -1)
             check_untouched(picture, model, "the picture")
+            check_unpressed(picture, model, "the picture")
 
 
 def balls(model: SensorModel) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -197,4 +203,8 @@ def test_real_presses_pass_and_their_faults_do_not(folder: str, model: SensorMod
         with pytest.raises(UserError, match=says):
             check_untouched(np.ascontiguousarray(change(untouched)), model, "the picture")
     presses = list(pictures.values())[::4]
+    check_unpressed(untouched, model, "the picture")
+    for press in presses:
+        with pytest.raises(UserError, match="begins in touch"):
+            check_unpressed(press, model, "the picture")
     check_presses(untouched, presses, model, "the presses")

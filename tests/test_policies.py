@@ -16,8 +16,8 @@ from rerun_rows import rerun_rows
 from toy_episodes import record
 
 from touchgoal.control import features as ft
+from touchgoal.control.sensors.clip import read_frames
 from touchgoal.encoders.training.weights import WeightsFormat
-from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain, islice
 
 import numpy as np
 
@@ -11,7 +12,13 @@ from touchgoal.control.calibration.ball import DepthErrors, find_circle, sphere_
 from touchgoal.control.calibration.press_fit import move_circles
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile import picture_guard
-from touchgoal.control.tactile.background import Background, Drift, local_change
+from touchgoal.control.tactile.background import (
+    SETTLES_WITHIN,
+    Background,
+    Drift,
+    first_steady,
+    local_change,
+)
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.force import estimate_force
@@ -88,10 +95,13 @@ def check_sensor(
     marker grid.
     """
     frames = iter(frames)
-    first = next(frames, None)
-    if first is None:
+    start = list(islice(frames, SETTLES_WITHIN))
+    if not start:
         raise UserError("no frames came: nothing to check")
+    settled = first_steady(np.stack(start), "the sensor")
+    first, frames = start[settled], chain(start[settled + 1 :], frames)
     picture_guard.check_untouched(first, sensor, "the first frame")
+    picture_guard.check_unpressed(first, sensor, "the recording")
     calibration = load(sensor.sensor_file)
     detector = ContactDetector(Background(first[None]))
     dots = _Dots(first, sensor)

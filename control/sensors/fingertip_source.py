@@ -6,10 +6,9 @@ from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
-
 from touchgoal.control.arrays import Picture
 from touchgoal.control.interfaces import DriverError
+from touchgoal.control.sensors.clip import open_clip
 from touchgoal.control.sensors.tactile_camera import (
     Crop,
     TactileCamera,
@@ -19,12 +18,8 @@ from touchgoal.control.sensors.tactile_camera import (
 from touchgoal.control.sensors.usb_cameras import find_sensor_camera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import SensorModel
-from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Corners
-from touchgoal.runtime.picture_file import read_picture
 
-_PICTURES = (".png", ".jpg", ".jpeg")
-_UNTOUCHED = "background.png"  # untouched sensor of a folder of presses
 _POLL_INTERVAL = 0.005  # s between looks for a new frame
 _TIMEOUT = 5.0  # s without a new frame after which the sensor counts as lost
 
@@ -89,29 +84,6 @@ def recorded_frames(
     Without corners of the gel the pictures count as already cut. UserError if there are none, or
     they have other proportions than the sensor's.
     """
-    empty, view = True, Crop(corners=corners)
-    for frame in _folder(source) if source.is_dir() else _video(source):
-        empty = False
+    view = Crop(corners=corners)
+    for frame in open_clip(source).frames():
         yield crop_to_sensor(frame, model, view)
-    if empty:
-        raise UserError(
-            f"{source} holds no pictures: give a video, or a folder of PNG or JPEG files"
-        )
-
-
-def _folder(folder: Path) -> Generator[Picture, None, None]:
-    files = [path for path in folder.iterdir() if path.suffix.lower() in _PICTURES]
-    for path in sorted(files, key=lambda path: (path.name != _UNTOUCHED, path.name)):
-        picture = read_picture(path)
-        if picture is None:
-            raise UserError(f"{path} is no picture")
-        yield picture
-
-
-def _video(path: Path) -> Generator[Picture, None, None]:
-    capture = cv2.VideoCapture(str(path))
-    try:
-        while (read := capture.read())[0]:
-            yield cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB)
-    finally:
-        capture.release()

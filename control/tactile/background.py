@@ -1,11 +1,12 @@
 """Background of a sensor: its untouched picture, followed as the light drifts."""
 
+import sys
 from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 from scipy.fft import dct
 
 from touchgoal.control.arrays import AnyPicture, Counts, Picture, Pictures
@@ -24,7 +25,12 @@ _RATE = 0.02  # weight of a new frame: a time constant of 2 s at 25 Hz, slower t
 # Standard deviations between 150,000 real touches of Minis (Tactile-MNIST), counts.
 _OFFSET_SPREAD, _PATTERN_SPREAD = 2.4, 2.4
 _MOVED = 1.5  # counts of local change among the first frames, more than noise alone makes
+_START = 5  # frames of which the untouched picture is the median
+_SAME_SHAPE = 5.0  # counts of local change, above the strongest compression noise: more is a touch
 _JITTER = 1.0  # px by which a camera shakes; dots that move farther together are a touch
+
+SETTLES_WITHIN = 15
+"""First frames of a recording, in which its exposure may still settle."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +95,37 @@ class Background:
             gain[c], offset[c] = np.linalg.solve(normal, explain.T @ change[:, c] / variance)
         pattern = np.abs(change - gain * reference - offset).max(0)
         return Drift(1 + gain, offset, pattern.astype(np.float64))
+
+
+def untouched_frames(frames: Pictures) -> UInt8[np.ndarray, "k h w 3"]:
+    """Return the five frames from which a recording's untouched picture is taken: see `first_steady`."""
+    first = first_steady(frames)
+    return frames[first : first + _START]
+
+
+def first_steady(frames: Pictures, name: str = "") -> int:
+    """Return the first frame after the exposure has settled; until then the light alone changes.
+
+    It is looked for among the first 15 frames, if there are as many, and told on stderr if a `name`
+    is given.
+    """
+    first = 0
+    if len(frames) >= SETTLES_WITHIN:
+        later = frames[SETTLES_WITHIN - 1]
+        while first < SETTLES_WITHIN - _START and _settling(frames[first], later):
+            first += 1
+    if first and name:
+        left_out = f"frames 0 to {first - 1} are left out of the untouched picture"
+        print(f"{name}: {left_out}: the light of those after them differs", file=sys.stderr)
+    return first
+
+
+def _settling(frame: Picture, later: Picture) -> bool:
+    """Return whether the light, and nothing else, differs from a later frame's."""
+    gain = light_gain(frame, later)
+    if (np.abs(gain - 1) < LARGE_CHANGE).all():
+        return False
+    return float(local_change(divide_gain(frame, gain), later).max()) < _SAME_SHAPE
 
 
 def local_change(frame: AnyPicture, background: AnyPicture) -> Float32[np.ndarray, "H W"]:

@@ -36,6 +36,10 @@ _SAME_UNIT = 0.035  # difference below which the file was made from this very un
 _OPEN = 1.5  # factor on the difference within which presses have to decide
 _EXPLAINS = 0.8  # share of the unexplained change that a better order or mirror may leave
 UNEXPLAINED = 0.65  # share of a press's change that a sensor file may leave unexplained
+_PRESSED = 5.0  # counts of local change, less than a light press makes
+_PRESS_LEFT = (
+    0.45  # share left unexplained: real presses on their own unit 0.08 to 0.29, dust from 0.60
+)
 _MAX_PRESSES = 6  # number of presses that are read
 _CELL = 8  # px of a cell in which changes are averaged; the finest of the depth that is read
 _STRONGEST = 0.1  # share of the picture over which the explanation is judged
@@ -127,6 +131,25 @@ def check_untouched(picture: Picture, sensor: SensorModel, name: str) -> None:
     if fault := find_seam(picture) or _fault(_compare(picture, sensor)):
         raise UserError(
             f"{name} is no picture of a {sensor.name} as its sensor file shows it: {fault}"
+        )
+
+
+def check_unpressed(picture: Picture, sensor: SensorModel, name: str) -> None:
+    """Refuse a picture that is taken for untouched, but which the sensor file explains as a press.
+
+    It holds for plain gels of the unit that the file was made of; dots would be read as change.
+    `name` is for the UserError.
+    """
+    calibration = load(sensor.sensor_file)
+    background = calibration.background.astype(np.float32)
+    change = local_change(remove_gain(picture, background), background)
+    if sensor.markers is not None or float(change.max()) < _PRESSED:
+        return
+    read = explain(DepthEstimator(calibration, _CELL), calibration, picture, background)
+    if read.unexplained <= _PRESS_LEFT:
+        raise UserError(
+            f"{name} begins in touch: its first frames are taken for the untouched gel, but the "
+            "sensor file reads them as pressed; begin with nothing on the gel"
         )
 
 

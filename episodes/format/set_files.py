@@ -8,7 +8,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from touchgoal.episodes.format.other_formats import refuse_other_format
+from touchgoal.control.sensors.clip import refuse_other_format
 from touchgoal.episodes.schema import drop_pixel_format
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.json_file import parse_json

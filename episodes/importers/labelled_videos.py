@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from touchgoal.control.sensors.clip import read_frames
 from touchgoal.episodes.importers.tables import check_there, read_table
-from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.touches import touch_background
 from touchgoal.runtime.errors import UserError
 

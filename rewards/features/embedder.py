@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT, WRENCH
-from touchgoal.control.tactile.picture_guard import check_untouched
+from touchgoal.control.tactile.background import first_steady, untouched_frames
+from touchgoal.control.tactile.picture_guard import check_unpressed, check_untouched
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.pretrained import AnyTouchEncoder
@@ -161,8 +162,11 @@ class EpisodeEmbedder:
                 raise UserError(missing_camera(source, self.camera, cameras))
         sensor = SENSORS.get(self.made_with.sensor)
         for side in sides:
+            first_steady(first[side], f"{side} of {source}")
             if sensor is not None:
-                check_untouched(touch_background(first[side]), sensor, f"{side} of {source}")
+                background = touch_background(first[side])
+                check_untouched(background, sensor, f"{side} of {source}")
+                check_unpressed(background, sensor, f"{side} of {source}")
         about = EmbeddedEpisode(
             {}, self.made_with if sides else self._images_with, source, fps, sides
         )
@@ -285,7 +289,7 @@ class FeatureStream:
     def __init__(self, embedder: EpisodeEmbedder, first: Frames, about: EmbeddedEpisode) -> None:
         """Take the background of the fingertips from the first frames; see `embedder.stream`."""
         self._embedder, self._about = embedder, about
-        untouched = {side: first[side][:START_FRAMES] for side in about.sides}
+        untouched = {side: untouched_frames(first[side]) for side in about.sides}
         self._backgrounds = {side: touch_background(frames) for side, frames in untouched.items()}
         sensor = SENSORS.get(embedder.made_with.sensor)
         # newest frames of each side, for encoders of several

@@ -23,7 +23,7 @@ from touchgoal.control.features import (
     TACTILE_RIGHT,
     WRIST,
 )
-from touchgoal.episodes.media import PICTURES, VIDEOS, Clip, in_natural_order, open_clip
+from touchgoal.control.sensors.clip import PICTURES, VIDEOS, Clip, in_natural_order, open_clip
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.sources.trajectory import Skipped, Source, Trajectory, frames_per_chunk
