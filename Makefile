@@ -125,7 +125,7 @@ fragile-carry: $(READY)
 # The shipped policies: the expert is recorded, the policy trained, and in each round of DAgger the policy acts and
 # the expert's actions are recorded. Interrupted, the same line continues: recorded seeds and finished trainings
 # are skipped. Delays are wider than measured on the wire. 1 to 2 hours on 2 cores each.
-DEPLOYED := --env.as-deployed --env.deployment.state-delay 0 0.05 --env.deployment.picture-delay 0 0.08 \
+DEPLOYED := --env.as-deployed --env.deployment.state-delay 0 0.05 --env.deployment.image-delay 0 0.08 \
 	--env.deployment.command-delay 0 0.04 --env.deployment.jitter 0 0.03 --env.deployment.plan-ticks 0 1 1 2
 # Arguments: set, episodes, first seed (runtime/seeds.py), options.
 define record

@@ -8,8 +8,8 @@ from benchmarks.records import describe, records_of
 from touchgoal.launch.support.command_line import parse
 from touchgoal.launch.support.process import run_command, standard_streams
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.image_file import write_image
 from touchgoal.runtime.json_file import write_json
-from touchgoal.runtime.picture_file import write_picture
 from touchgoal.runtime.provenance import hardware, provenance
 from touchgoal.runtime.run_folder import check_writable, open_run
 
@@ -78,8 +78,8 @@ def _run(name: str, *options: str) -> None:
     out = open_run(config.out, f"benchmark-{name}", config)
     result = benchmark.run(config)
     print(result.pop("table"))
-    for title, picture in result.pop("pictures", {}).items():
-        write_picture(out / f"{title}.png", picture)
+    for title, image in result.pop("pictures", {}).items():
+        write_image(out / f"{title}.png", image)
         print(f"picture: {out / title}.png")
     print(f"hardware: {hardware()}")
     write_json(out / "metrics.json", {**provenance(), "hardware": hardware(), **result})

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from touchgoal.control import features as ft
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.features import Observation
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
@@ -58,11 +58,11 @@ class GripperReading:
 
 @dataclass(frozen=True)
 class Frame:
-    """An RGB picture."""
+    """An RGB image."""
 
-    image: Picture
+    image: Image
     sequence: int  #: number of frames taken, unread ones included
-    stamp: float  #: s, right after the grab; for a frozen camera, when its picture last changed
+    stamp: float  #: s, right after the grab; for a frozen camera, when its image last changed
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Films of simulated episodes: pictures, a curve beside them, a caption below."""
+"""Films of simulated episodes: images, a curve beside them, a caption below."""
 
 import io
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from PIL import Image
 from touchgoal.control.features import TRUTH_PROGRESS
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
-from touchgoal.sim_envs.scene.filming import TICKS_PER_PICTURE
+from touchgoal.sim_envs.scene.filming import TICKS_PER_IMAGE
 
 BLACK = "#000000"
 COLORS = ("#0072B2", "#D55E00", "#CC79A7", BLACK, "#009E73", "#56B4E9", "#E69F00", "#7A5C2E")
@@ -27,16 +27,16 @@ _CAPTION = 24  # px, height of the caption
 
 def write_film(
     path: Path,
-    pictures: UInt8[np.ndarray, "n h w 3"],
+    images: UInt8[np.ndarray, "n h w 3"],
     episode: Episode,
     control_hz: int,
     curves: Mapping[str, Float[np.ndarray, " ticks"]] | None = None,
     label: str = "",
 ) -> None:
-    """Write an MP4 that plays in real time: pictures, curves up to now, object, outcome, seed, time.
+    """Write an MP4 that plays in real time: images, curves up to now, object, outcome, seed, time.
 
     Args:
-        pictures: of `record_with_film`, one every `TICKS_PER_PICTURE` ticks.
+        images: of `record_with_film`, one every `TICKS_PER_IMAGE` ticks.
         control_hz: ticks per second.
         curves: values at each tick, which may end before the episode; default: the simulator's
             progress.
@@ -45,14 +45,14 @@ def write_film(
     if curves is None:
         curves, label = {"progress": episode.frames[TRUTH_PROGRESS][:, 0]}, "progress"
     end = (len(episode) - 1) / control_hz
-    panel, box = _draw_panel(pictures.shape[1], curves, control_hz, end, label)
+    panel, box = _draw_panel(images.shape[1], curves, control_hz, end, label)
     frames = []
-    for k, picture in enumerate(pictures):
-        t = k * TICKS_PER_PICTURE / control_hz
-        beside = np.hstack([picture, _up_to(panel, box, t / end)])
+    for k, image in enumerate(images):
+        t = k * TICKS_PER_IMAGE / control_hz
+        beside = np.hstack([image, _up_to(panel, box, t / end)])
         caption = _caption(beside.shape[1], caption_of(episode), f"{t:.1f} s")
         frames.append(np.vstack([beside, caption]))
-    write_video(path, np.stack(frames), control_hz / TICKS_PER_PICTURE)
+    write_video(path, np.stack(frames), control_hz / TICKS_PER_IMAGE)
 
 
 def caption_of(episode: Episode) -> str:

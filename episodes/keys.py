@@ -14,7 +14,7 @@ from touchgoal.episodes.schema import INDEX_DTYPES, is_image
 from touchgoal.runtime.errors import UserError
 
 Features = dict[str, dict[str, Any]]
-_PICTURES = ("image", "video")
+_IMAGES = ("image", "video")
 _SENSOR_NAMES = ("tactile", "gelsight", "digit", "touch")
 _SIDES = {"left": TACTILE_LEFT, "right": TACTILE_RIGHT}
 
@@ -46,7 +46,7 @@ def readable_features(features: Features) -> Features:
         shape = list(feature["shape"]) or [1]
         info = feature.get("info") or {}
         depth = info.get("is_depth_map") or info.get("video.is_depth_map")
-        if feature["dtype"] in _PICTURES:
+        if feature["dtype"] in _IMAGES:
             if str((feature.get("names") or [""])[0]).startswith("channel"):
                 shape = [*shape[1:], shape[0]]
             if len(shape) == 3 and shape[2] == 3 and not depth:
@@ -69,13 +69,13 @@ def guess_keys(features: Features) -> dict[str, str]:
 
     Of tactile images one of each side is taken, or a single one as the left.
     """
-    pictures = [key for key, feature in features.items() if feature["dtype"] in _PICTURES]
+    images = [key for key, feature in features.items() if feature["dtype"] in _IMAGES]
     guessed = {
         key: IMAGE_PREFIX + re.sub(r"^observation\.(images?\.)?", "", key).replace(".", "_")
-        for key in pictures
+        for key in images
         if not is_image(key)
     }
-    touch = [key for key in pictures if any(name in key.lower() for name in _SENSOR_NAMES)]
+    touch = [key for key in images if any(name in key.lower() for name in _SENSOR_NAMES)]
     for side, key in _SIDES.items():
         found = [stored for stored in touch if side in stored.lower()]
         if len(touch) == 1 and not any(name in touch[0].lower() for name in _SIDES):
@@ -100,7 +100,7 @@ def stored_names(root: Path, features: Features, keys: Mapping[str, str]) -> dic
                 f"{root}: {names[key]} and {stored} are both {key}; give one of them another key: "
                 f"--keys {names[key]}=OTHER"
             )
-        if (features[stored]["dtype"] in _PICTURES) != is_image(key):
+        if (features[stored]["dtype"] in _IMAGES) != is_image(key):
             raise UserError(
                 f"--keys {stored}={key}: keys of images, and only these, begin with {IMAGE_PREFIX}"
             )

@@ -62,8 +62,8 @@ def _encode(
         stream.width, stream.height, stream.pix_fmt = width, height, pixels
         stream.time_base = 1 / rate
         stream.codec_context.thread_count = 1  # the same bytes on every machine
-        for i, picture in enumerate(frames):
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+        for i, image in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
             frame.pts, frame.time_base = i, 1 / rate
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
@@ -81,7 +81,7 @@ def decode_video(
     wanted, interval = sorted(set(frames)), KEY_FRAME_INTERVAL
     with av.open(io.BytesIO(video) if isinstance(video, bytes) else str(video), "r") as container:
         stream = container.streams.video[0]
-        pictures = np.empty((len(wanted), stream.height, stream.width, 3), np.uint8)
+        images = np.empty((len(wanted), stream.height, stream.width, 3), np.uint8)
         stream.codec_context.thread_count = 1  # readers are themselves many
         convert = VideoReformatter()
         decoder, position = container.decode(stream), -1
@@ -97,8 +97,8 @@ def decode_video(
                 if frame is None or position > target:
                     raise UserError(f"the video has no frame {target}")
                 if position == target:
-                    pictures[row] = convert.reformat(frame, format="rgb24").to_ndarray()
-    return pictures[np.searchsorted(wanted, np.asarray(frames, np.int64))]
+                    images[row] = convert.reformat(frame, format="rgb24").to_ndarray()
+    return images[np.searchsorted(wanted, np.asarray(frames, np.int64))]
 
 
 def video_length(path: Path) -> tuple[int, float]:

@@ -40,7 +40,7 @@ class EpisodeSpec:
 
 
 OnTick = Callable[[dict[str, np.ndarray], UInt8[np.ndarray, "h w 3"]], None]
-"""Takes each tick that `run` yields, and the film's newest picture."""
+"""Takes each tick that `run` yields, and the film's newest image."""
 CORRECTED = "corrected"
 """Outcome of an episode in which a policy acted while an expert's actions were recorded."""
 Roles = Callable[[Any, EpisodeSpec], tuple[Actor, Actor]]
@@ -154,11 +154,11 @@ def record_with_film(
     at_most = round(env.config.max_seconds * env.config.control_hz)
     for tick in track(run(env, actor, observation, info), "filming", "frame", total=at_most):
         ticks.append(tick)
-        picture = film.capture()
+        image = film.capture()
         if on_tick is not None:
-            on_tick(tick, picture)
+            on_tick(tick, image)
     film.close()
-    return to_episode(env, ticks, spec), film.pictures
+    return to_episode(env, ticks, spec), film.images
 
 
 def to_episode(

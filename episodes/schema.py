@@ -109,7 +109,7 @@ def _check_key(features: dict[str, Feature], key: str, values: np.ndarray) -> No
 
 def _check_image_shape(key: str, shape: tuple[int, ...]) -> None:
     if len(shape) != 4 or shape[3] != 3 or 0 in shape:
-        raise UserError(f"{key} has shape {shape}: pictures are (T, h, w, 3), RGB")
+        raise UserError(f"{key} has shape {shape}: images are (T, h, w, 3), RGB")
     # H.264 in yuv420p, as `write_video` writes it, shares one colour sample between 2 x 2 pixels.
     if is_camera(key) and (shape[1] % 2 or shape[2] % 2):
         raise UserError(f"{key} is {shape[1]} x {shape[2]}: a camera needs even height and width")

@@ -85,15 +85,15 @@ def slide_episode(slide: Slide) -> Recorded:
 
 
 def left_fingertip(
-    pictures: UInt8[np.ndarray, "t h w 3"],
+    images: UInt8[np.ndarray, "t h w 3"],
     wrench: Float32[np.ndarray, "t 6"],
     slip: Bool[np.ndarray, " t"],
 ) -> dict[str, np.ndarray]:
     """Return the columns of the left fingertip, and of a right one without contact."""
-    n = len(pictures)
+    n = len(images)
     nothing = np.zeros(n, bool)
     return {
-        TACTILE_LEFT: pictures,
+        TACTILE_LEFT: images,
         TRUTH_PAD_WRENCH: np.hstack([wrench, np.zeros((n, 6), np.float32)]),
         TRUTH_CONTACT: np.column_stack([wrench[:, 2] < 0, nothing]),
         TRUTH_SLIP: np.column_stack([slip, nothing]),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.features import TACTILE, TACTILE_LEFT, TRUTH_CONTACT, WRIST
 from touchgoal.control.sensors.exchanged import fingertips_exchanged
 from touchgoal.control.tactile.background import (
@@ -16,7 +16,7 @@ from touchgoal.control.tactile.background import (
     untouched_frames,
 )
 from touchgoal.control.tactile.contact import ContactDetector, threshold_for
-from touchgoal.control.tactile.picture_guard import check_untouched
+from touchgoal.control.tactile.image_guard import check_untouched
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
@@ -103,7 +103,7 @@ class DrawnFrames:
     frames: UInt8[np.ndarray, "n h w 3"]  # raw sensor RGB, one side each
     column: Int[np.ndarray, " n"]  # fingertip of each frame, counted among those recorded
     in_contact: Bool[np.ndarray, " n"]  # of each frame
-    background: list[Picture]  # of each fingertip, untouched
+    background: list[Image]  # of each fingertip, untouched
     contact: Bool[np.ndarray, "t s"]  # of every tick
 
 
@@ -145,11 +145,11 @@ def check_touches(episodes: EpisodeSet) -> list[int]:
 
 
 def check_fingertips(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
-    """Refuse a set whose fingertip pictures are not its sensor's, or in which left and right change places.
+    """Refuse a set whose fingertip images are not its sensor's, or in which left and right change places.
 
     The first frames of some episodes are compared with the sensor file, and with each other.
 
-    UserError: see `picture_guard.check_untouched`; or two episodes have them exchanged.
+    UserError: see `image_guard.check_untouched`; or two episodes have them exchanged.
     """
     keys = [key for key in TACTILE if key in episodes.features]
     looked_at = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)]
@@ -169,7 +169,7 @@ def check_fingertips(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
             )
 
 
-def _exchanged(frames: tuple[Picture, Picture], first: tuple[Picture, Picture]) -> bool:
+def _exchanged(frames: tuple[Image, Image], first: tuple[Image, Image]) -> bool:
     """Whether the same two sensors changed sides; new sensors, as simulation draws them, do not count."""
     crossed = max(float(local_change(frames[k], first[1 - k]).mean()) for k in (0, 1))
     return crossed < _SAME_SENSOR and fingertips_exchanged(frames, first)

@@ -19,7 +19,7 @@ COMMANDS = {
     "record-demos": "lead an arm or the twin by SpaceMouse or keys, and record demonstrations",
     "annotate": "find and caption the objects that VisGel's recordings touch",
     "train-encoder": "train a touch encoder",
-    "train-pose-estimator": "train the network that finds object and goal in a camera picture",
+    "train-pose-estimator": "train the network that finds object and goal in a camera image",
     "train-policy": "train a policy on recorded episodes",
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "costs and rewards along episodes or plain videos",

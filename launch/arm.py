@@ -35,11 +35,11 @@ class Config:
 def main(config: Config) -> None:
     """Connect, ask, act, report."""
     from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
-    from touchgoal.control.deployment.manual import without_pictures
+    from touchgoal.control.deployment.manual import without_images
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.launch.support.confirm import confirm
 
-    cell = without_pictures(read_cell_file(find_cell_file(config.cell)))
+    cell = without_images(read_cell_file(find_cell_file(config.cell)))
     if cell.arm == "sim":
         raise UserError(
             "a simulated arm ends with its command: give a real arm's cell file or a twin's"

@@ -1,6 +1,6 @@
 """Fit a sensor's light, gel and noise to ball presses, and write its sensor file.
 
-PRESSES, as `touchgoal record-presses` makes it, holds background.png (the untouched sensor), pictures
+PRESSES, as `touchgoal record-presses` makes it, holds background.png (the untouched sensor), images
 of the presses, and presses.csv with the columns file and ball_mm (the ball's radius). Contact circles
 are found, unless x_px, y_px and radius_px give them (the first pixel is 0, 0). Use two sizes of ball.
 """
@@ -28,7 +28,7 @@ class Config:
     ball_mm: Positive | None = None
     """Radius of the ball, mm, for presses without ball_mm in presses.csv."""
     check_lamps: bool = True
-    """Refuse pictures with channels exchanged, mirrored or turned against the model's sensor file; switch
+    """Refuse images with channels exchanged, mirrored or turned against the model's sensor file; switch
     it off for a sensor whose lamps are placed otherwise."""
     illumination_exponent: Positive | None = None
     """Power of the background's brightness by which the response varies over the image; default: the
@@ -57,12 +57,12 @@ def main(config: Config) -> None:
     )
     from touchgoal.control.calibration.press_set import read_presses, split
     from touchgoal.control.calibration.report import light_compass
-    from touchgoal.control.tactile.picture_guard import check_presses, check_untouched
+    from touchgoal.control.tactile.image_guard import check_presses, check_untouched
     from touchgoal.control.tactile.sensor_calibration import save
     from touchgoal.control.tactile.sensor_models import find_model
     from touchgoal.runtime.errors import UserError
+    from touchgoal.runtime.image_file import write_image
     from touchgoal.runtime.json_file import write_json
-    from touchgoal.runtime.picture_file import write_picture
     from touchgoal.runtime.progress import progress_bar
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run
@@ -78,7 +78,7 @@ def main(config: Config) -> None:
     if config.check_lamps:
         background, where = presses.background, config.presses
         check_untouched(background, model, f"{where}/background.png")
-        check_presses(background, list(presses.images), model, f"the pictures in {where}")
+        check_presses(background, list(presses.images), model, f"the images in {where}")
     out = open_run(config.out, "calibrate", config)
     train, test = split(presses, round(config.held_out * len(presses)), config.seed)
     power = config.illumination_exponent
@@ -113,5 +113,5 @@ def main(config: Config) -> None:
     save(fitted.calibration, out / "sensor_file", {**source, **metrics})
     write_json(out / "metrics.json", metrics)
     report.draw_held_out(judged, test, out / "held_out.png")
-    write_picture(out / "lights.png", light_compass(fitted.calibration))
-    print(f"sensor file: {out / 'sensor_file'}; pictures: {out / 'held_out.png'}, lights.png")
+    write_image(out / "lights.png", light_compass(fitted.calibration))
+    print(f"sensor file: {out / 'sensor_file'}; images: {out / 'held_out.png'}, lights.png")

@@ -153,11 +153,11 @@ def _read_poses(path: Path, n_joints: int) -> list[Any]:
 
 
 def _save_views(views: "list[View]", out: Path) -> None:
+    from touchgoal.runtime.image_file import write_image
     from touchgoal.runtime.json_file import write_json
-    from touchgoal.runtime.picture_file import write_picture
 
     for i, view in enumerate(views):
-        write_picture(out / f"view_{i:02d}.png", view.image)
+        write_image(out / f"view_{i:02d}.png", view.image)
     write_json(out / "joints.json", [view.q.tolist() for view in views])
 
 

@@ -1,7 +1,7 @@
 """Check a sensor, or a sensor file, on your own frames: noise, drift, contact, depth, force, markers.
 
 SOURCE is a USB serial number, a device (/dev/video2), a stream's address, a video, or a folder of
-pictures. Leave the gel untouched for the first second, then press any object, press a ball
+images. Leave the gel untouched for the first second, then press any object, press a ball
 (--ball-mm), or lay a weight on the gel (--weight-g).
 """
 
@@ -27,12 +27,12 @@ class Config:
     sensor: str = "gelsight_mini"
     """Model of the sensor (`touchgoal list sensors`), or the folder that calibrate made of it."""
     corners: Corners | None = None
-    """Corners of the gel in the camera's picture, x and y in px: top left, top right, bottom left, bottom
+    """Corners of the gel in the camera's image, x and y in px: top left, top right, bottom left, bottom
     right; for a camera that sees its gel at an angle (gelsight_wedge)."""
     ball_mm: Positive | None = None
     """Radius of the pressed ball, mm, to compare with the radius that the depth shows."""
     weight_g: Positive | None = None
-    """Weight on the gel, g, to compare with the force that the pictures show."""
+    """Weight on the gel, g, to compare with the force that the images show."""
     exposure: Positive | None = None
     """Exposure to lock, in the camera's units; default: as it is set."""
     seconds: Positive = 20.0
@@ -50,8 +50,8 @@ def main(config: Config) -> None:
     from touchgoal.control.calibration.sensor_check import check_sensor
     from touchgoal.control.sensors.fingertip_source import is_recorded, open_frames
     from touchgoal.control.tactile.sensor_models import find_sensor
+    from touchgoal.runtime.image_file import write_image
     from touchgoal.runtime.json_file import write_json
-    from touchgoal.runtime.picture_file import write_picture
     from touchgoal.runtime.run_folder import open_run
     from touchgoal.runtime.viewer.stream import open_rerun
 
@@ -69,7 +69,7 @@ def main(config: Config) -> None:
     figures = check_report.figures(check, config.ball_mm, config.weight_g)
     print("\n".join(check_report.lines(check, figures)))
     write_json(out / "metrics.json", figures)
-    write_picture(out / "check.png", check_report.picture(check))
+    write_image(out / "check.png", check_report.image(check))
     print(f"presses, their change and depth: {out / 'check.png'}")
 
 

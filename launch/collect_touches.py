@@ -28,8 +28,8 @@ class Config:
     command continues an interrupted recording."""
     body: Literal["wand", "slide"] = "wand"
     """wand: each of 102 objects touched anywhere with 0 to 20 N, with four views, force and sentences (the
-    MMWand data set). slide: one object slid and turned over the sensor for a second, 66 pictures at 60 Hz,
-    to learn from without labels; Sparsh's 460,000 pictures are 7,000 of these."""
+    MMWand data set). slide: one object slid and turned over the sensor for a second, 66 images at 60 Hz,
+    to learn from without labels; Sparsh's 460,000 images are 7,000 of these."""
     episodes: Count | None = None
     """Number of touches or slides; by default 5182 touches, as MMWand has, or 300 slides. With a real wand:
     number of touches of this object; by default without end."""

@@ -60,14 +60,14 @@ def main(config: Config) -> None:
 
     env, hz = PickPlace(config.env), config.env.control_hz
     chosen = {"object": config.env.objects[0]}
-    episode, pictures = record_with_film(env, EpisodeSpec(config.seed, options=chosen))
+    episode, images = record_with_film(env, EpisodeSpec(config.seed, options=chosen))
     env.close()
     held = until_release(episode)
     EpisodeWriter(out / "episodes", hz).append(held)
     curves = reward.curves(reward.embedder.embed_episode(held, hz, str(held.meta["object"])))
     write_report(curves, out, "curves", reward.provenance())
     shown = {FUSED: curves.parts[FUSED], **curves.plain}
-    write_film(out / "episode.mp4", pictures, episode, hz, shown, "distance to goal")
+    write_film(out / "episode.mp4", images, episode, hz, shown, "distance to goal")
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
     write_json(out / "metrics.json", {k: m.as_dict() for k, m in curves.metrics().items()})
     print(metrics_table([curves]))

@@ -95,7 +95,7 @@ def main(config: Config) -> None:
             numbers.append(metrics(result))
         say(report(result, metrics(result), str(out / "episodes")))
         if result.success:
-            _save_goal_picture(result, out / "goal.png")
+            _save_goal_image(result, out / "goal.png")
         if ending.stopped and (not cell.moves_nothing_real or ending.reason == STOPPED_BY_OPERATOR):
             break
         if cell.moves_nothing_real:
@@ -182,7 +182,7 @@ def _open_device(config: Config, connection: "CellConnection", seed: int) -> "Te
     return ScriptedDevice(poses, seed)
 
 
-def _save_goal_picture(result: "Result", path: Path) -> None:
+def _save_goal_image(result: "Result", path: Path) -> None:
     """Write the front camera's last image, if there is one: a goal for task.rewards."""
     from PIL import Image
 

@@ -1,8 +1,8 @@
 """Record presses of a ball all over a sensor's gel, and fit its sensor file to them.
 
 SOURCE is a USB serial number, a device (/dev/video2), a stream's address, or a recording: a video
-or a folder of pictures. Leave the gel untouched for a second. Then press the ball where the live
-picture shows, hold still until the press is recorded, and lift. Ctrl-C ends and keeps the presses.
+or a folder of images. Leave the gel untouched for a second. Then press the ball where the live
+image shows, hold still until the press is recorded, and lift. Ctrl-C ends and keeps the presses.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ class Config:
     source: Annotated[str, tyro.conf.Positional]
     """USB serial number, device, or stream's address of the sensor; or a recording of it."""
     ball_mm: Positive
-    """Radius of the ball, mm: measure it, because pictures do not show it."""
+    """Radius of the ball, mm: measure it, because images do not show it."""
     mm_per_pixel: Positive
     """Length on the gel that a pixel shows, mm."""
     sensor: str = "gelsight_mini"
@@ -31,12 +31,12 @@ class Config:
     white_balance: Annotated[int, Field(ge=1000, le=15_000)] | None = None
     """White balance to lock, K; default: as it is set."""
     corners: Corners | None = None
-    """Corners of the gel in the camera's picture, x and y in px: top left, top right, bottom left, bottom
+    """Corners of the gel in the camera's image, x and y in px: top left, top right, bottom left, bottom
     right; for a camera that sees its gel at an angle (gelsight_wedge)."""
     presses_per_part: Count = 2
-    """Presses wanted in each of the 12 parts of the picture."""
+    """Presses wanted in each of the 12 parts of the image."""
     port: Port = 8095
-    """Port of the live picture, for a browser on this computer."""
+    """Port of the live image, for a browser on this computer."""
     resume: bool = False
     """Go on in the folder --out, with another ball or more presses of this one."""
     calibrate: bool = True
@@ -52,7 +52,7 @@ def main(config: Config) -> None:
     from touchgoal.control.calibration.press_recorder import PressRecorder, record_presses
     from touchgoal.control.calibration.press_set import MINIMUM, write_presses
     from touchgoal.control.sensors.fingertip_source import is_recorded, open_frames
-    from touchgoal.control.sensors.live_picture import LivePicture
+    from touchgoal.control.sensors.live_image import LiveImage
     from touchgoal.control.tactile.sensor_models import find_model
     from touchgoal.launch import calibrate
     from touchgoal.runtime.errors import UserError
@@ -71,9 +71,9 @@ def main(config: Config) -> None:
     )
     out = open_run(config.out, "record-presses", config, adds=config.resume)
     recorder = PressRecorder(model.image_shape, config.presses_per_part)
-    with closing(frames), nullcontext() if recorded else closing(LivePicture(config.port)) as live:
+    with closing(frames), nullcontext() if recorded else closing(LiveImage(config.port)) as live:
         if live is not None:
-            print(f"live picture: {live.address}")
+            print(f"live image: {live.address}")
         record_presses(frames, recorder, live)
     if not recorder.images:
         raise UserError(f"no press was recorded; the last hint was: {recorder.hint}")

@@ -127,7 +127,7 @@ class Words:
     """Random surfaces that teach roughness and bumpiness beside the objects."""
     backgrounds: str = "screen"
     """Background of the objects in the views: screen (the green screen, as recorded), generated, or a
-    folder of pictures."""
+    folder of images."""
     heads: HeadsConfig = HeadsConfig()
     """Training of the maps."""
     seed: Seed = 0

@@ -50,9 +50,9 @@ class Config:
     """Give the arm's force estimate noise, bias and drift, as on a real arm."""
     host: str = "127.0.0.1"
     """Address to serve at; twins at different loopback addresses run side by side. At any other address
-    the whole network can drive this twin and see its pictures."""
+    the whole network can drive this twin and see its images."""
     port: Annotated[int, Field(ge=0, le=65534)] = 8080
-    """TCP port of the pictures; the next one is the control port. 0: any that are free."""
+    """TCP port of the images; the next one is the control port. 0: any that are free."""
     seed: Seed = seeds.EVALUATION.start
     """Random seed of the scene."""
     out: Path | None = None
@@ -94,9 +94,9 @@ def main(config: Config) -> None:
         twin.run()
     finally:
         twin.close()
-    pictures = twin.pictures
+    images = twin.images
     numbers: dict[str, float] = dict(twin.pace.summary())
-    numbers |= {"pictures_taken": pictures.taken, "pictures_left_out": pictures.left_out}
+    numbers |= {"pictures_taken": images.taken, "pictures_left_out": images.left_out}
     write_json(out / "metrics.json", numbers)
     print("\n" + "\n".join(_pace_lines(numbers)) + "stopped")
 
@@ -111,7 +111,7 @@ def open_to_network(host: str) -> str:
             return ""
     return (
         f"--host {host} is open to the network: any computer there can drive this arm and see its "
-        "pictures; only the control port asks for a token"
+        "images; only the control port asks for a token"
     )
 
 
@@ -132,9 +132,9 @@ def _pace_lines(numbers: dict[str, float]) -> list[str]:
     return [
         f"{numbers['seconds']} s with a client that drives the arm: simulated over wall time "
         f"{numbers['pace_median']:.2f} in the median second, {numbers['pace_slowest']:.2f} in the slowest",
-        f"pictures left out to keep pace: {numbers['pictures_left_out']} of "
+        f"images left out to keep pace: {numbers['pictures_left_out']} of "
         f"{numbers['pictures_taken'] + numbers['pictures_left_out']}",
         f"processor time a simulated second: {numbers['processor_twin']:.2f} s, and "
-        f"{numbers['processor_pictures']:.2f} s for pictures",
+        f"{numbers['processor_pictures']:.2f} s for images",
         "",
     ]

@@ -8,7 +8,7 @@ from lerobot.cameras import Camera, CameraConfig
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from touchgoal.control import features as ft
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
 from touchgoal.control.cell.connection import camera_formats, connect_camera
 from touchgoal.control.deployment.observation import crop_and_resize
@@ -16,7 +16,7 @@ from touchgoal.control.interfaces import Frame
 from touchgoal.control.sensors.usb_cameras import list_cameras
 from touchgoal.runtime.errors import UserError
 
-_TIMEOUT_MS = 10_000.0  # for the next picture, as lerobot's own cameras
+_TIMEOUT_MS = 10_000.0  # for the next image, as lerobot's own cameras
 
 
 @CameraConfig.register_subclass("touchgoal")
@@ -32,7 +32,7 @@ class TouchgoalCameraConfig(CameraConfig):
     def __post_init__(self) -> None:
         cell = read_cell_file(find_cell_file(Path(self.cell)))
         if cell.lock_step:
-            raise UserError("a twin in lock-step sends pictures to its arm alone: start it without")
+            raise UserError("a twin in lock-step sends images to its arm alone: start it without")
         offered = {k.removeprefix(ft.IMAGE_PREFIX): f for k, f in camera_formats(cell).items()}
         if self.camera not in offered:
             raise UserError(f"{self.cell} has no camera {self.camera}: name one of {[*offered]}")
@@ -64,19 +64,19 @@ class TouchgoalCamera(Camera):
         if warmup:
             self._fresh(_TIMEOUT_MS)
 
-    def read(self) -> Picture:
-        """Wait for the next picture."""
+    def read(self) -> Image:
+        """Wait for the next image."""
         self._last = self._fresh(_TIMEOUT_MS).sequence
         return self.async_read(_TIMEOUT_MS)
 
-    def async_read(self, timeout_ms: float = 200) -> Picture:
-        """Return the newest picture that was not read yet; wait for one if need be."""
+    def async_read(self, timeout_ms: float = 200) -> Image:
+        """Return the newest image that was not read yet; wait for one if need be."""
         frame = self._fresh(timeout_ms, known=self._last)
         self._last = frame.sequence
         return crop_and_resize(frame.image, (self.height, self.width))
 
-    def read_latest(self, max_age_ms: float = 500) -> Picture:
-        """Return the newest picture at once."""
+    def read_latest(self, max_age_ms: float = 500) -> Image:
+        """Return the newest image at once."""
         return crop_and_resize(self._fresh(0.0, max_age_ms).image, (self.height, self.width))
 
     @check_if_not_connected

@@ -140,8 +140,8 @@ class LearnedPolicy(Planner):
             self.embed(history)
             _, touch, state = zip(*self._embedded, strict=True)
             touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (touch, state))
-            pictures, maps = self._difference_images(history[-1]), self._feature_maps(history[-1])
-            batch = ObservationBatch(touch, state, pictures, maps)
+            images, maps = self._difference_images(history[-1]), self._feature_maps(history[-1])
+            batch = ObservationBatch(touch, state, images, maps)
             self._refuse_novel(batch)
             rest = self._generator, self._width, self._key_pose
             actions = self._network.plan(batch, *rest)[0].numpy()

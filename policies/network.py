@@ -131,7 +131,7 @@ class ObservationBatch:
     touch: Float[Tensor, "b o e"]  # frozen embeddings of left and right fingertip, side by side
     state: Float[Tensor, "b o s"]  # `PolicyConfig.proprioception`, side by side, SI units
     # difference images of the latest tick, for the end-to-end encoder; None without
-    pictures: UInt8[Tensor, "b k h w 3"] | None = None
+    images: UInt8[Tensor, "b k h w 3"] | None = None
     # feature maps of the latest tick's camera images, see `ImageEmbedder`; None without
     maps: Float16[Tensor, "b k c y x"] | None = None
 
@@ -235,9 +235,9 @@ class PolicyNetwork(nn.Module):
             key_pose_loss = self.key_pose.loss(batch.maps.float(), *hand, key_pose[:, 1:])
             pose = kp.true_pose(hand[0], key_pose)
             draws = 1 if self.end_to_end_encoder else _DRAWS
-            rows = batch.touch, batch.state, batch.pictures, pose, actions, wrench, action_is_pad
-            touch, state, pictures, pose, actions, wrench, action_is_pad = _repeated(rows, draws)
-            batch = ObservationBatch(touch, state, pictures)
+            rows = batch.touch, batch.state, batch.images, pose, actions, wrench, action_is_pad
+            touch, state, images, pose, actions, wrench, action_is_pad = _repeated(rows, draws)
+            batch = ObservationBatch(touch, state, images)
         chunk = to_representation(actions, batch.joints, self.config.representation)
         if pose is not None and self.config.representation == "body_twist":
             pose, chunk = kp.face_any_way(pose, chunk, noise)
@@ -348,8 +348,8 @@ class PolicyNetwork(nn.Module):
             )
         parts = [torch.cat([touch, state], -1).flatten(1)]
         if self.end_to_end_encoder:
-            assert batch.pictures is not None, "needs tactile images"
-            parts.append(self.end_to_end_encoder(batch.pictures))
+            assert batch.images is not None, "needs tactile images"
+            parts.append(self.end_to_end_encoder(batch.images))
         if pose is not None:
             parts.append(kp.features(pose, noise))
         return torch.cat(parts, 1)

@@ -30,7 +30,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture
+from touchgoal.runtime.image_file import read_image
 
 Modality = Literal["image", "tactile", "text"]
 MODALITIES: tuple[Modality, ...] = ("image", "tactile", "text")
@@ -90,7 +90,7 @@ class GoalImage:
         name, pixels = "the goal image", self.image
         if isinstance(pixels, Path):
             name, path = f"goal image {pixels}", pixels
-            if (pixels := read_picture(path)) is None:
+            if (pixels := read_image(path)) is None:
                 wrong = "cannot be read as an image" if path.exists() else "does not exist"
                 raise UserError(f"{name} {wrong}")
         height, width, _ = pixels.shape

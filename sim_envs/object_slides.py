@@ -17,7 +17,7 @@ from touchgoal.sim_envs.tactile.forces import ForceField
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
-FPS = 60  # pictures a second, a DIGIT's
+FPS = 60  # images a second, a DIGIT's
 FRICTION = 0.6  # friction coefficient of an object on the gel
 LOAD = 0.5, 5.0  # N: range of the normal load
 REST = 6

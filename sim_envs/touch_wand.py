@@ -53,7 +53,7 @@ class TouchWandConfig:
 class Touch(WandTouch):
     """One simulated touch."""
 
-    # force (N) and torque (Nm) of the object on the gel at each picture, sensor frame
+    # force (N) and torque (Nm) of the object on the gel at each image, sensor frame
     wrench: Float32[np.ndarray, "t 6"]
 
 
@@ -173,7 +173,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         return Touch(before, self._render(), clip, load, wrench)
 
     def untouched(self, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the untouched gel's picture, with the camera's noise drawn from `rng`."""
+        """Return the untouched gel's image, with the camera's noise drawn from `rng`."""
         return self._instance.with_dots(render_untouched(self._instance, rng))
 
     def random_action(self) -> Float[np.ndarray, "6"]:
@@ -225,17 +225,17 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
     def _press(
         self, point: Float[np.ndarray, "3"], forces: Float[np.ndarray, " t"]
     ) -> tuple[UInt8[np.ndarray, "t h w 3"], Float32[np.ndarray, " t"], Float32[np.ndarray, "t 6"]]:
-        """Press with rising forces (N) where the wand is; return pictures, loads and wrenches."""
+        """Press with rising forces (N) where the wand is; return images, loads and wrenches."""
         bench, pad = self.bench, self._pad
         assert pad is not None
         geoms = bench.geoms_near(point, _PATCH)
-        pictures, wrenches = [], []
+        images, wrenches = [], []
         for force in forces:
             contact = PadContact(np.array([0, 0, -force]), np.zeros(3), 0.0, geoms)
             frame = pad.sense(bench.data, contact, self.np_random)
-            pictures.append(frame.image)
+            images.append(frame.image)
             wrenches.append(np.zeros(6) if frame.field is None else frame.field.wrench())
-        return np.stack(pictures), forces.astype(np.float32), np.array(wrenches, np.float32)
+        return np.stack(images), forces.astype(np.float32), np.array(wrenches, np.float32)
 
     def _aim(
         self, point: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"]
@@ -271,11 +271,11 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
     def _observation(
         self,
         views: dict[str, UInt8[np.ndarray, "H W 3"]],
-        picture: UInt8[np.ndarray, "h w 3"],
+        image: UInt8[np.ndarray, "h w 3"],
         load: float,
     ) -> Observation:
         observation = {ft.IMAGE_PREFIX + name: view for name, view in views.items()}
-        return observation | {ft.TACTILE_LEFT: picture, ft.LOAD: np.array([load], np.float32)}
+        return observation | {ft.TACTILE_LEFT: image, ft.LOAD: np.array([load], np.float32)}
 
     def _observe_untouched(self) -> Observation:
         clip, _, _ = self._press(np.zeros(3), np.zeros(1))

@@ -18,12 +18,12 @@ _PIXELS_PER_METRE = 8000
 
 def add_board(spec: mujoco.MjSpec, held: bool, board: Board = BOARD) -> None:
     """A thin plate whose upper side shows the board; no contact."""
-    picture = np.pad(board.draw(_PIXELS_PER_METRE), 8, constant_values=255)
-    rows, columns = picture.shape
+    image = np.pad(board.draw(_PIXELS_PER_METRE), 8, constant_values=255)
+    rows, columns = image.shape
     texture = spec.add_texture(
         name="board", type=mujoco.mjtTexture.mjTEXTURE_2D, width=columns, height=rows, nchannel=3
     )
-    texture.data = np.repeat(picture[..., None], 3, axis=2).tobytes()
+    texture.data = np.repeat(image[..., None], 3, axis=2).tobytes()
     material = spec.add_material(name="board", specular=0.0, shininess=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "board"
     width, height = (side / _PIXELS_PER_METRE for side in (columns, rows))
@@ -42,7 +42,7 @@ def add_board(spec: mujoco.MjSpec, held: bool, board: Board = BOARD) -> None:
 
 
 class BoardScene:
-    """Camera pictures of the board at any posture of the arm, and the camera's true pose."""
+    """Camera images of the board at any posture of the arm, and the camera's true pose."""
 
     def __init__(self, camera: str, rows: int, columns: int) -> None:
         self.on_hand, self._camera = camera == "wrist", camera
@@ -54,7 +54,7 @@ class BoardScene:
             self._data.joint(f"finger_joint{i}").qpos = 0.04
         self._renderer = open_renderer(self._model, rows, columns)
 
-    def picture(self, q: np.ndarray) -> np.ndarray:
+    def image(self, q: np.ndarray) -> np.ndarray:
         """RGB, as a twin's stream shows it: through JPEG."""
         for name, value in zip(arm_joints("fr3"), q, strict=True):
             self._data.joint(name).qpos = value
@@ -92,7 +92,7 @@ def postures(scene: BoardScene, n: int, seed: int) -> list[np.ndarray]:
             [0.1, 0.1, 0.1] if scene.on_hand else [0.18, 0.15, 0.15]
         )
         solution = kinematics.solve_ik_near(place, tilt @ fingers_down(0.0), FR3.arm.home)
-        view = BOARD.find(scene.picture(solution.q)) if solution.reached else None
+        view = BOARD.find(scene.image(solution.q)) if solution.reached else None
         if view is not None and len(view.points) > 15:
             found.append(solution.q)
     return found

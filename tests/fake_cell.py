@@ -105,7 +105,7 @@ class FakeGripper:
 
 @dataclass
 class FakeCamera:
-    """A camera that shows one picture, new each time and `late` (s)."""
+    """A camera that shows one image, new each time and `late` (s)."""
 
     clock: FakeClock
     image: np.ndarray

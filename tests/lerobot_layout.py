@@ -84,11 +84,11 @@ def toy_frames(seed: int, n: int = 24) -> Frames:
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[:32, :48]
     moving = 20 + 4 * np.arange(n)[:, None, None] + columns + rows
-    picture = np.stack([moving, moving // 2, np.full_like(moving, 20 * seed)], -1).astype(np.uint8)
+    image = np.stack([moving, moving // 2, np.full_like(moving, 20 * seed)], -1).astype(np.uint8)
     return {
-        "observation.images.top": picture,
-        "observation.images.gelsight_left": picture[:, ::-1],
-        "observation.images.gelsight_right": picture[:, :, ::-1],
+        "observation.images.top": image,
+        "observation.images.gelsight_left": image[:, ::-1],
+        "observation.images.gelsight_right": image[:, :, ::-1],
         "observation.state": rng.normal(size=(n, 6)).astype(np.float32),
         "action": rng.normal(size=(n, 6)).astype(np.float64),
     }

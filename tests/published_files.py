@@ -13,7 +13,7 @@ UNTOUCHED = {"red": (150, 120, 90), "blue": (80, 110, 160)}
 
 
 def gel(seed: int, shape: tuple[int, int] = (320, 240), light: str = "red") -> np.ndarray:
-    """A smooth picture with a bump somewhere."""
+    """A smooth image with a bump somewhere."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[: shape[0], : shape[1]]
     place = rng.uniform((0.2, 0.2), (0.8, 0.8)) * shape
@@ -21,10 +21,10 @@ def gel(seed: int, shape: tuple[int, int] = (320, 240), light: str = "red") -> n
     return (np.array(UNTOUCHED[light]) + bump[:, :, None] * (1, -0.5, 0.3)).astype(np.uint8)
 
 
-def encoded(picture: np.ndarray, kind: str = "JPEG") -> bytes:
-    """Encode an RGB picture with PIL."""
+def encoded(image: np.ndarray, kind: str = "JPEG") -> bytes:
+    """Encode an RGB image with PIL."""
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, kind, **({"quality": 95} if kind == "JPEG" else {}))
+    Image.fromarray(image).save(file, kind, **({"quality": 95} if kind == "JPEG" else {}))
     return file.getvalue()
 
 
@@ -46,17 +46,17 @@ def write_slides(folder: Path, objects: tuple[str, ...] = ("004_sugar_box", "bre
         (folder / "bgs" / f"bg_{k}.jpg").write_bytes(encoded(plain))
 
 
-def near(picture: np.ndarray, true: np.ndarray) -> bool:
-    """Return whether two pictures differ by no more than JPEG's loss."""
-    return bool(np.abs(picture.astype(int) - true).mean() < 2)
+def near(image: np.ndarray, true: np.ndarray) -> bool:
+    """Return whether two images differ by no more than JPEG's loss."""
+    return bool(np.abs(image.astype(int) - true).mean() < 2)
 
 
 def write_force_batch(
     batch: Path, sensor: str = "digit", strokes: int = 2, light: str = "red", late: int = 0
 ) -> dict[int, dict[str, np.ndarray]]:
-    """A batch of TacBench's force estimation: eight pictures a stroke, of which two are untouched.
+    """A batch of TacBench's force estimation: eight images a stroke, of which two are untouched.
 
-    Pressing is negative, as a load cell under the probe may have it. Of `late` pictures more than forces
+    Pressing is negative, as a load cell under the probe may have it. Of `late` images more than forces
     `indexes` tells, as in the published flat and sharp batches.
     """
     shape = (320, 240)
@@ -89,15 +89,15 @@ def pose_change(shift_x_mm: float, shift_y_mm: float, yaw: float) -> np.ndarray:
 
 
 def write_pose_set(
-    folder: Path, bags: int = 2, pictures: int = 8, shape: tuple[int, int] = (320, 240)
+    folder: Path, bags: int = 2, images: int = 8, shape: tuple[int, int] = (320, 240)
 ) -> None:
     """TacBench's pose estimation, of the ring finger alone: motions grow by 0.3 mm and 0.2 degrees."""
     for use in ("train", "test"):
         for k, name in enumerate(("pringles", "sugar")):
             for bag in range(bags):
                 seed = 1000 * k + 100 * bag + (50 if use == "test" else 0)
-                frames = [encoded(gel(seed + t, shape)) for t in range(pictures)]
-                steps = np.arange(pictures + 1) - pictures // 2
+                frames = [encoded(gel(seed + t, shape)) for t in range(images)]
+                steps = np.arange(images + 1) - images // 2
                 poses = [pose_change(0.3 * s, -0.6 * s, np.radians(0.2 * s)) for s in steps]
                 value = {"digit_ring": frames, "object_ring_rel_pose_n5": np.stack(poses)}
                 write(folder / use / name / f"bag_{bag:02d}.pkl", value)
@@ -107,7 +107,7 @@ def write_pose_set(
 
 
 def write_grasps(path: Path, held: list[bool]) -> None:
-    """A file of Feeling of Success: RGB pictures given to OpenCV's writer, which takes BGR."""
+    """A file of Feeling of Success: RGB images given to OpenCV's writer, which takes BGR."""
     value: dict[str, list[Any]] = {
         "object_name": [np.bytes_(b"mug") for _ in held],
         "is_gripping": [np.bool_(h) for h in held],

@@ -63,8 +63,8 @@ class RunningTwin:
         self.at_rest()
         self.ask(line)
 
-    def pause_pictures(self, seconds: float) -> None:
-        """Let the process that draws its pictures stand still for a while."""
+    def pause_images(self, seconds: float) -> None:
+        """Let the process that draws its images stand still for a while."""
         pid = self._process.pid
         (drawing,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
         os.kill(int(drawing), signal.SIGSTOP)

@@ -51,10 +51,10 @@ def published(
     return weights
 
 
-def plain_forward(w: dict[str, Tensor], pictures: Tensor) -> Tensor:
-    """Features (n, d) of one picture (c, h, w) or clip (c, t, h, w), one patch and head at a time."""
+def plain_forward(w: dict[str, Tensor], images: Tensor) -> Tensor:
+    """Features (n, d) of one image (c, h, w) or clip (c, t, h, w), one patch and head at a time."""
     kernel = w["patch_embed.proj.weight"]
-    clip = pictures if pictures.ndim == 4 else pictures[:, None]
+    clip = images if images.ndim == 4 else images[:, None]
     kernel = kernel if kernel.ndim == 5 else kernel[:, :, None]
     step = kernel.shape[2]
     tokens = []

@@ -46,14 +46,14 @@ def test_nothing_between_is_the_plain_environment() -> None:
     assert not BLIND.resolved_deployment().tracker
 
 
-@pytest.mark.parametrize("option", ["state_delay", "picture_delay"])
+@pytest.mark.parametrize("option", ["state_delay", "image_delay"])
 def test_what_is_seen_is_as_old_as_it_says(option: str) -> None:
     config = replace(BLIND, cameras=("front",), camera_size=(32, 32))
     here = roll(moving(), config, between={})
     late = roll(moving(), config, between={option: (0.1, 0.1)})
     for key in (ft.STATE, ft.TCP_POSE, ft.WRENCH, ft.FRONT):
-        pictures = key == ft.FRONT
-        ticks = 2 if pictures == (option == "picture_delay") else 0
+        images = key == ft.FRONT
+        ticks = 2 if images == (option == "image_delay") else 0
         now, then = column(here, key), column(late, key)
         assert np.array_equal(then[ticks:], now[: len(now) - ticks]), key
         assert np.array_equal(then[:ticks], now[:1].repeat(ticks, 0)), key
@@ -90,9 +90,9 @@ def test_commands_are_seen_without_delay() -> None:
         np.testing.assert_allclose(command[1:, 7:], moving()[:, :7] * 20, atol=1e-4)
 
 
-def test_the_truth_of_the_pads_is_as_old_as_their_pictures() -> None:
+def test_the_truth_of_the_pads_is_as_old_as_their_images() -> None:
     def contact(delay: float) -> np.ndarray:
-        between = replace(PLAIN, picture_delay=(delay, delay))
+        between = replace(PLAIN, image_delay=(delay, delay))
         env = BeadMaze(BeadMazeConfig(cameras=(), tactile=False, deployment=between))
         env.reset(seed=3)
         infos = [env.step(np.zeros(8))[-1] for _ in range(12)]

@@ -149,7 +149,7 @@ def set_row(column: int, value: str) -> Callable[[Path], None]:
             "8 presses, calibration needs at least 16",
         ),
         (lambda f: (f / "background.png").unlink(), "background.png is missing"),
-        (set_row(1, "170"), "lies outside the 160 x 120 picture"),
+        (set_row(1, "170"), "lies outside the 160 x 120 image"),
         (set_row(3, "30"), "does not fit a ball of radius 3 mm"),
         (set_row(4, ""), "the ball's radius is missing"),
         (lambda f: shutil.copy(f / "background.png", f / "00.png"), "shows no contact"),
@@ -213,7 +213,7 @@ def test_a_press_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
         write_presses(presses, tmp_path)
 
 
-def test_circles_are_found_in_the_pictures(tmp_path: Path) -> None:
+def test_circles_are_found_in_the_images(tmp_path: Path) -> None:
     """No column of circles: the visible disc is larger than the contact, which the fit then finds."""
     made = made_presses(known_sensor(), 16)
     write_presses(made, tmp_path)

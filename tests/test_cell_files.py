@@ -72,7 +72,7 @@ def test_the_cells_tool_is_the_one_that_is_watched(tmp_path: Path) -> None:
     assert before - after > 0.1
 
 
-def test_a_touch_ceiling_that_no_picture_can_show_is_refused() -> None:
+def test_a_touch_ceiling_that_no_image_can_show_is_refused() -> None:
     require_readable(find_sensor("digit"), 1.5e-3)
     require_readable(find_sensor("gelsight_mini"), FR3.indentation)
     with pytest.raises(UserError, match="deeper than the sensor file of the gelsight_mini"):

@@ -14,7 +14,7 @@ from touchgoal.control.sensors.clip import open_clip, read_frames
 from touchgoal.control.sensors.fingertip_source import recorded_frames
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture
+from touchgoal.runtime.image_file import read_image
 
 FPS, LENGTH = 10, 12
 FRAMES = moving_blob(LENGTH, 240, 320, 0)[[0, 1, 2, 3, 3, 3, 6, 7, 8, 8, 10, 11]]  # stands twice
@@ -102,22 +102,22 @@ def test_what_cannot_be_honoured_is_refused_by_name(
 def test_images_are_turned_and_converted_by_rule(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    picture, path = FRAMES[0], tmp_path / "a.png"
-    turned, exif = Image.fromarray(np.rot90(picture)), Image.Exif()
+    image, path = FRAMES[0], tmp_path / "a.png"
+    turned, exif = Image.fromarray(np.rot90(image)), Image.Exif()
     exif[0x0112] = 6  # orientation: turn by 90 degrees clockwise
     turned.save(path, exif=exif)
-    np.testing.assert_array_equal(read_picture(path), picture)
-    Image.fromarray(picture).convert("L").save(path)
-    grey = read_picture(path)
-    assert grey is not None and grey.shape == picture.shape and not np.ptp(grey, axis=2).any()
-    read_picture(path)
+    np.testing.assert_array_equal(read_image(path), image)
+    Image.fromarray(image).convert("L").save(path)
+    grey = read_image(path)
+    assert grey is not None and grey.shape == image.shape and not np.ptp(grey, axis=2).any()
+    read_image(path)
     assert capsys.readouterr().err.count("grey images") == 1, "said once"
-    cv2.imwrite(str(path), np.dstack([picture, np.full(picture.shape[:2], 255, np.uint8)]))
-    assert read_picture(path) is not None, "an opaque alpha channel hides nothing"
+    cv2.imwrite(str(path), np.dstack([image, np.full(image.shape[:2], 255, np.uint8)]))
+    assert read_image(path) is not None, "an opaque alpha channel hides nothing"
     for fault, stored in {
-        "transparent pixels": np.dstack([picture, picture[..., 0]]),
-        "16 bits a channel": picture.astype(np.uint16) * 257,
+        "transparent pixels": np.dstack([image, image[..., 0]]),
+        "16 bits a channel": image.astype(np.uint16) * 257,
     }.items():
         cv2.imwrite(str(path), stored)
         with pytest.raises(UserError, match=f"a.png has {fault}: save it"):
-            read_picture(path)
+            read_image(path)

@@ -202,7 +202,7 @@ def test_touches(tmp_path: Path, truth: bool) -> None:
     touched = bumped[:, 50, 60, 0] > 15
     assert touched.tolist() == [name != "" for name in touches.object]
     assert np.abs(bumped[~touched].mean(axis=(1, 2, 3))).max() < 2, "the background is its own"
-    # the last frame before contact is 19; five frames earlier the wrist picture is 14 * 6 bright
+    # the last frame before contact is 19; five frames earlier the wrist image is 14 * 6 bright
     assert touches.view[:2].mean(axis=(1, 2, 3)) == pytest.approx(14 * 6, abs=3)
     np.testing.assert_array_equal(touches.view_index, touches.background_index // 2)
     again = collect_touches(episodes, 8, 3, seed=0)

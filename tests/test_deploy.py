@@ -75,7 +75,7 @@ def test_a_stalled_camera_stops_the_arm_and_the_episode_is_kept(tmp_path: Path) 
         twin.ask("stall front 600")
         while twin.ask("truth")["rest"] < 1 and process.poll() is None:  # longer than it is held
             time.sleep(0.02)
-        twin.ask("stall front 0")  # a program that ends waits for the picture on its way
+        twin.ask("stall front 0")  # a program that ends waits for the image on its way
         _, complaint = process.communicate(timeout=_PATIENCE)
     assert process.returncode == STOPPED and "observation age" in complaint and "front" in complaint
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())

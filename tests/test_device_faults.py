@@ -135,7 +135,7 @@ def test_whatever_a_device_raises_a_run_ends_in_good_order(
         assert np.isfinite(ending.rest_seconds) == (where != "arm.read")
 
 
-class NewPictures(FakeCamera):
+class NewImages(FakeCamera):
     def read(self) -> Any:
         self.image = self.image.copy()
         return super().read()
@@ -143,9 +143,9 @@ class NewPictures(FakeCamera):
 
 @pytest.mark.parametrize("recorded", [False, True])
 def test_memory_does_not_grow_with_a_pause_or_a_run(recorded: bool, tmp_path: Path) -> None:
-    """The pictures of 400 ticks take 20 MB."""
+    """The images of 400 ticks take 20 MB."""
     cell, sizes = FakeCell(), {}
-    cell.cameras[ft.FRONT] = NewPictures(cell.clock, np.zeros(ft.CAMERA_SHAPE, np.uint8))
+    cell.cameras[ft.FRONT] = NewImages(cell.clock, np.zeros(ft.CAMERA_SHAPE, np.uint8))
     recorder = EpisodeRecorder(tmp_path / "episodes", ft.CONTROL_HZ)
     log = RunLog(recorder.add) if recorded else RunLog()
 

@@ -73,7 +73,7 @@ def test_recipes_of_the_makefile_are_understood(target: str, here: Path) -> None
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with what the pages take for granted: a video, a picture, files of one's own."""
+    """A folder with what the pages take for granted: a video, an image, files of one's own."""
     folder = tmp_path_factory.mktemp("desk")
     frames = np.random.default_rng(0).integers(0, 256, (12, 96, 128, 3), dtype=np.uint8)
     write_video(folder / "my_video.mp4", frames, 20)

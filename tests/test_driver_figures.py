@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from both_sides import complaint, sides
-from numbered_pictures import numbered
+from numbered_images import numbered
 
 from touchgoal.control.arms import driver_process, franka, streaming, ur
 from touchgoal.control.arms.driver_process import DriverProcess
@@ -24,9 +24,9 @@ from touchgoal.control.interfaces import ArmReading, DriverError, Frame
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.safety.limits import FR3, UR5E
 from touchgoal.control.sensors import exchanged, fingertip_source, video
+from touchgoal.control.sensors.image_integrity import FrozenParts
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.sensors.load_cell import LoadCellConfig, Sample, SerialLoadCell, parse
-from touchgoal.control.sensors.picture_integrity import FrozenParts
 from touchgoal.control.sensors.tactile_camera import NO_CROP, crop_to_sensor
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
@@ -294,7 +294,7 @@ def test_a_first_reading_is_waited_for_five_seconds(monkeypatch: Patch) -> None:
     value.close()
 
 
-def test_how_old_a_picture_may_be(wall: Wall, monkeypatch: Patch) -> None:
+def test_how_old_a_image_may_be(wall: Wall, monkeypatch: Patch) -> None:
     """Late after three periods, frozen after half a second; a stream opens in 5 s, then in one."""
     jpeg = cv2.imencode(".jpg", numbered(1))[1].reshape(1, -1)
     capture, opened = MagicMock(), MagicMock()
@@ -314,9 +314,9 @@ def test_how_old_a_picture_may_be(wall: Wall, monkeypatch: Patch) -> None:
         wall.now = age
         assert bool(camera.problem) == late
     assert [stamp(camera, now) for now in (0.49, 0.51)] == [0.49, 0.0]
-    patient = VideoCamera(VideoConfig("http://twin", frozen_after=0.0, frozen_pictures=2))
+    patient = VideoCamera(VideoConfig("http://twin", frozen_after=0.0, frozen_images=2))
     stamps = [stamp(patient, now) for now in (0.51, 0.61, 0.71, 0.81)]
-    assert stamps == [0.51, 0.61, 0.71, 0.51], "the third unchanged picture is old"
+    assert stamps == [0.51, 0.61, 0.71, 0.51], "the third unchanged image is old"
     patient.close()
     capture.grab.return_value = False
     camera._take()
@@ -359,19 +359,19 @@ def test_when_cameras_and_fingertips_look_exchanged(monkeypatch: Patch) -> None:
 
 
 @sides((15, 16))
-def test_a_band_that_changed_in_16_of_20_pictures_is_watched(value: int, beyond: bool) -> None:
+def test_a_band_that_changed_in_16_of_20_images_is_watched(value: int, beyond: bool) -> None:
     parts, since = FrozenParts(), []
     for k in range(21):
-        picture = np.full((80, 8, 3), k, np.uint8)
-        picture[:10] = min(k, value)
-        since.append(parts.update(picture, float(k)))
+        image = np.full((80, 8, 3), k, np.uint8)
+        image[:10] = min(k, value)
+        since.append(parts.update(image, float(k)))
     assert since == [*range(20), value if beyond else 20]
 
 
 @sides((311, 310), (329, 330))
 def test_a_fingertips_proportions_are_right_within_3_percent(value: int, beyond: bool) -> None:
-    picture = np.zeros((240, value, 3), np.uint8)
-    assert bool(complaint(crop_to_sensor, picture, GELSIGHT_MINI, NO_CROP)) == beyond
+    image = np.zeros((240, value, 3), np.uint8)
+    assert bool(complaint(crop_to_sensor, image, GELSIGHT_MINI, NO_CROP)) == beyond
 
 
 @pytest.mark.parametrize("client", [franka.FrankaClient, ur.UrClient])

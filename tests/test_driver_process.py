@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from numbered_pictures import until
+from numbered_images import until
 
 from touchgoal.control.arms.driver_process import DriverProcess
 from touchgoal.control.arms.franka import FrankaClient

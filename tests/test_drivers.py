@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numbered_pictures import until
+from numbered_images import until
 from running_twin import RunningTwin
 
 from touchgoal.control.arms import franka

@@ -153,7 +153,7 @@ def test_damaged_files_are_refused(tmp_path: Path, damage: str) -> None:
         (lambda x: x[0], "one image needs its background"),
     ],
 )
-def test_embed_refuses_what_is_no_picture(wrong: Callable, message: str) -> None:
+def test_embed_refuses_what_is_no_image(wrong: Callable, message: str) -> None:
     images = np.zeros((3, 240, 320, 3), np.uint8)
     with pytest.raises(UserError, match=message) as error:
         make_encoder().embed(wrong(images))
@@ -162,7 +162,7 @@ def test_embed_refuses_what_is_no_picture(wrong: Callable, message: str) -> None
         check_images("images", torch.from_numpy(images), ndim=(3, 4))
 
 
-def test_embed_takes_one_picture_or_many() -> None:
+def test_embed_takes_one_image_or_many() -> None:
     encoder = make_encoder()
     images = np.random.default_rng(0).integers(0, 256, (3, 240, 320, 3), dtype=np.uint8)
     many = encoder.embed(images)

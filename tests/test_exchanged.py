@@ -31,11 +31,11 @@ from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 STARTS = 10
 
 
-def drifted(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def drifted(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Change the light as between days: gain, offset and a smooth pattern (spreads of `background.py`)."""
-    height = picture.shape[0]
+    height = image.shape[0]
     wave = np.cos(np.pi * rng.integers(1, 4) * np.arange(height) / height)[:, None, None]
-    changed = picture * (1 + 0.047 * rng.normal(size=3)) + 2.4 * rng.normal(size=3)
+    changed = image * (1 + 0.047 * rng.normal(size=3)) + 2.4 * rng.normal(size=3)
     return np.clip(changed + 2.4 * rng.normal() * wave, 0, 255).astype(np.uint8)
 
 
@@ -51,15 +51,15 @@ def test_exchanged_fingertips_are_noticed_at_every_start() -> None:
 
 
 def preflighted(
-    pictures: list[np.ndarray], untouched: list[np.ndarray], folder: Path
+    images: list[np.ndarray], untouched: list[np.ndarray], folder: Path
 ) -> dict[str, CheckResult]:
     """The pre-flight's lines on two fingertips that show these, each with a sensor file of its own."""
     cell, files = FakeCell(), []
-    for key, picture, background in zip(ft.TACTILE, pictures, untouched, strict=True):
+    for key, image, background in zip(ft.TACTILE, images, untouched, strict=True):
         files.append(str(folder / key))
         shutil.copytree(GELSIGHT_MINI.sensor_file, files[-1])
         cv2.imwrite(f"{files[-1]}/background.png", background[..., ::-1])
-        camera = FakeCamera(cell.clock, picture)
+        camera = FakeCamera(cell.clock, image)
         cell.cameras[key] = TactileCamera(camera, find_sensor(files[-1]), NO_CROP)
     tips = 'fingertips = { sensor = "gelsight_mini", left = "http://l", right = "http://r", '
     file = write_cell_file(folder, f"{tips}sensor_files = {files} }}\n{SIM}")
@@ -84,14 +84,14 @@ def test_the_preflight_names_exchanged_and_touched_fingertips(tmp_path: Path) ->
 
 
 def test_exchanged_cameras_are_noticed_where_there_is_something_to_see() -> None:
-    """Pictures before and after a move of the arm."""
+    """Images before and after a move of the arm."""
     rng, noticed = np.random.default_rng(0), 0
     views = "front", "wrist"
     env = PickPlace(PickPlaceConfig(cameras=views, camera_size=(256, 256), tactile=False))
 
     def taken() -> list[np.ndarray]:
-        pictures = [env.render_camera(name) * rng.uniform(0.9, 1.1) for name in views]
-        noisy = [p + rng.normal(0, 3, p.shape) for p in pictures]
+        images = [env.render_camera(name) * rng.uniform(0.9, 1.1) for name in views]
+        noisy = [p + rng.normal(0, 3, p.shape) for p in images]
         return [np.clip(p, 0, 255).astype(np.uint8) for p in noisy]
 
     for seed in range(STARTS):
@@ -108,7 +108,7 @@ def test_exchanged_cameras_are_noticed_where_there_is_something_to_see() -> None
 
 @dataclass
 class CameraOnTheArm(FakeCamera):
-    """Shows a picture that moves as the first joint does."""
+    """Shows an image that moves as the first joint does."""
 
     arm: FakeArm | None = None
 

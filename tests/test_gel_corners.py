@@ -27,7 +27,7 @@ def pinhole(x: np.ndarray, y: np.ndarray, scale: float) -> tuple[np.ndarray, np.
 
 
 def seen_at_an_angle(scale: float) -> tuple[np.ndarray, tuple]:
-    """The picture, light grey with dark dots of 1 mm radius; the gel's corners in it."""
+    """The image, light grey with dark dots of 1 mm radius; the gel's corners in it."""
     high, wide = int(480 * scale), int(640 * scale)
     # Points of the gel, denser than the pixels; a pixel shows the mean of those that it sees.
     x, y = np.meshgrid(np.arange(0, WIDE, 0.02), np.arange(0, HIGH, 0.02))
@@ -37,19 +37,19 @@ def seen_at_an_angle(scale: float) -> tuple[np.ndarray, tuple]:
     count = np.bincount(pixel, minlength=high * wide)
     light = np.bincount(pixel, np.where(dark, 40.0, 200.0).ravel(), high * wide)
     grey = np.where(count > 0, light / np.maximum(count, 1), 30.0).reshape(high, wide)
-    picture = np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, 2)
+    image = np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, 2)
     ends = [(0.0, 0.0), (WIDE, 0.0), (0.0, HIGH), (WIDE, HIGH)]
     corners = [pinhole(np.array(a), np.array(b), scale) for a, b in ends]
-    return picture, tuple((float(a), float(b)) for a, b in corners)
+    return image, tuple((float(a), float(b)) for a, b in corners)
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.5])
 def test_a_gel_seen_at_an_angle_is_shown_from_above(scale: float) -> None:
-    picture, corners = seen_at_an_angle(scale)
-    flat = rectify(picture, SHAPE, corners)
+    image, corners = seen_at_an_angle(scale)
+    flat = rectify(image, SHAPE, corners)
     assert flat.shape == (*SHAPE, 3) and flat.dtype == np.uint8
     for x, y in DOTS:
-        # 10 px a millimetre; a picture's edge lies half a pixel out from the middle of its first pixel.
+        # 10 px a millimetre; an image's edge lies half a pixel out from the middle of its first pixel.
         column, row = 10 * x - 0.5, 10 * y - 0.5
         left, top = int(column) - 16, int(row) - 16
         darkness = 200.0 - flat[top : top + 33, left : left + 33, 0]
@@ -80,10 +80,10 @@ def test_a_wedges_camera_needs_its_corners() -> None:
 
 
 def test_a_cell_file_has_the_corners_of_either_gel(tmp_path: Path) -> None:
-    picture, corners = seen_at_an_angle(1.0)
+    image, corners = seen_at_an_angle(1.0)
     y, x = np.mgrid[:480, :640] // 4
-    picture = np.stack([x, 255 - x, y], -1).astype(np.uint8)  # as smooth as a gel
-    cv2.imwrite(str(tmp_path / "0.png"), picture[..., ::-1])
+    image = np.stack([x, 255 - x, y], -1).astype(np.uint8)  # as smooth as a gel
+    cv2.imwrite(str(tmp_path / "0.png"), image[..., ::-1])
     a, b, c, d = ((639 - x, y) for x, y in corners)
     mirrored = b, a, d, c
     both = [[list(point) for point in gel] for gel in (corners, mirrored)]
@@ -93,5 +93,5 @@ def test_a_cell_file_has_the_corners_of_either_gel(tmp_path: Path) -> None:
     assert cell.fingertips is not None and cell.fingertips.corners == (corners, mirrored)
     for side, gel in enumerate((corners, mirrored)):
         camera = connect_camera(cell, ft.TACTILE[side])
-        np.testing.assert_array_equal(camera.read().image, rectify(picture, SHAPE, gel))
+        np.testing.assert_array_equal(camera.read().image, rectify(image, SHAPE, gel))
         camera.close()

@@ -143,8 +143,8 @@ def test_boards_of_both_patterns_are_found(old: bool) -> None:
 
 
 def views(scene: BoardScene, joints: list[np.ndarray]) -> list[View]:
-    pictures = [scene.picture(q) for q in joints]
-    return [View(image, q, BOARD.find(image)) for image, q in zip(pictures, joints, strict=True)]
+    images = [scene.image(q) for q in joints]
+    return [View(image, q, BOARD.find(image)) for image, q in zip(images, joints, strict=True)]
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ def test_rows_and_frames_of_each_episode(foreign: Path, capsys: pytest.CaptureFi
 
 
 def test_checksums_are_of_the_content(foreign: Path, tmp_path: Path) -> None:
-    """Episodes of equal length and numbers whose pictures alone differ are not the same."""
+    """Episodes of equal length and numbers whose images alone differ are not the same."""
     other = [toy_frames(i, 24 + i) for i in range(3)]
     other[1]["observation.images.gelsight_left"] = other[1][TOP]
     write_lerobot_set(tmp_path / "other", other)

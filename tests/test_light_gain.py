@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.real_touch.picture_force import change_statistics
+from benchmarks.real_touch.image_force import change_statistics
 from touchgoal.control import features as ft
 from touchgoal.control.calibration.ball import find_circle
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector, contact_strength
 from touchgoal.control.tactile.depth import DepthEstimator
+from touchgoal.control.tactile.image_guard import explain
 from touchgoal.control.tactile.indentation import IndentationMeter
 from touchgoal.control.tactile.light_gain import (
     LARGE_CHANGE,
@@ -20,7 +21,6 @@ from touchgoal.control.tactile.light_gain import (
     light_gain,
     remove_gain,
 )
-from touchgoal.control.tactile.picture_guard import explain
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, SensorModel, find_sensor
 from touchgoal.encoders.preprocess import preprocessor_for
@@ -72,7 +72,7 @@ def test_any_light_is_taken_out_and_a_contact_is_not_taken_for_light(name: str) 
     assert max(covered) > 1 / 3
 
 
-def test_pictures_without_light_keep_their_numbers_finite() -> None:
+def test_images_without_light_keep_their_numbers_finite() -> None:
     rest, touched, _ = touches(GELSIGHT_MINI, 0)
     black = np.zeros_like(rest)
     for now, before in ((black, rest), (touched, black), (lit(rest, np.full(3, 9.0)), rest)):
@@ -136,15 +136,15 @@ def test_the_background_follows_the_light_and_still_reports_it() -> None:
     assert not still.drift().large
 
 
-def test_the_environment_changes_the_light_after_the_first_picture() -> None:
+def test_the_environment_changes_the_light_after_the_first_image() -> None:
     config = PickPlaceConfig(cameras=(), light_change=(-0.2, 0.1, 0.0))
-    pictures = []
+    images = []
     for env in (PickPlace(config), PickPlace(replace(config, light_change=(0.0,)))):
         first, _ = env.reset(seed=3)
         later, *_ = env.step(np.append(np.zeros(7), 0.08))
-        pictures.append((first[ft.TACTILE_LEFT], later[ft.TACTILE_LEFT]))
+        images.append((first[ft.TACTILE_LEFT], later[ft.TACTILE_LEFT]))
         env.close()
-    (first, later), (same, usual) = pictures
+    (first, later), (same, usual) = images
     np.testing.assert_array_equal(first, same)
     np.testing.assert_array_equal(later, lit(usual, np.array([0.8, 1.1, 1.0], np.float32)))
 
@@ -157,4 +157,4 @@ def test_a_large_change_of_the_light_is_reported_and_a_touch_is_not() -> None:
     assert abs(watch.change) < 0.02 < LARGE_CHANGE and not light_advice([watch.change])
     watch.update({ft.TACTILE_LEFT: touched, ft.TACTILE_RIGHT: lit(rest, DIM)})
     assert watch.change == pytest.approx(-0.2, abs=0.01)
-    assert "-20% after the first picture in 1 of 2 episodes" in light_advice([watch.change, 0.01])
+    assert "-20% after the first image in 1 of 2 episodes" in light_advice([watch.change, 0.01])

@@ -35,7 +35,7 @@ _SMALL = "--env.objects wooden_block --env.cameras front --env.camera-size 96 96
 
 
 def swing(
-    cell: CellConfig, pause: float, pause_pictures: Callable[[float], None] | None = None
+    cell: CellConfig, pause: float, pause_images: Callable[[float], None] | None = None
 ) -> list[np.ndarray]:
     """Return all readings of each tick while the arm swings and the hand closes."""
     reset_scene(cell.task.twin, cell.task.seed)
@@ -46,8 +46,8 @@ def swing(
         connection.gripper.command(0.0)
         connection.clock.wait(connection.clock.now() + 1 / ft.CONTROL_HZ)
         time.sleep(pause * (k % 2))  # a machine that is busy now and then
-        if pause_pictures and k == 4:
-            pause_pictures(2.0)  # twice as long as libfranka waits for a state
+        if pause_images and k == 4:
+            pause_images(2.0)  # twice as long as libfranka waits for a state
         arm, width = connection.arm.read(), connection.gripper.read().width
         assert connection.load_cell is not None
         load = connection.load_cell.read().force
@@ -66,7 +66,7 @@ def test_a_lock_step_twin_gives_the_same_run_to_the_last_bit(tmp_path: Path) -> 
         states = [seen for seen in first if seen.ndim == 1]
         assert states[-1][0] - states[0][0] > 0.05 and states[-1][-1] < 0.07
         assert states[-1][-2] == pytest.approx(_TICKS / ft.CONTROL_HZ)
-        again = swing(twin.cell, 0.1, twin.pause_pictures)
+        again = swing(twin.cell, 0.1, twin.pause_images)
         assert len(first) == len(again)
         assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
         left_at = twin.ask("truth")["time"]

@@ -75,7 +75,7 @@ class Load(FakeLoadCell):
 
 
 class Paced(FakeCamera):
-    """A camera that takes `rate` pictures a second."""
+    """A camera that takes `rate` images a second."""
 
     def read(self) -> Frame:
         return Frame(self.image, round(self.rate * self.clock.time), self.clock.time)
@@ -227,7 +227,7 @@ def test_a_twin_below_95_percent_of_real_time_is_named(pace: float, tick: int, s
         ("wrench", 7.49, 7.51, "at rest"),
         ("wrench", 7.49, np.nan, "near a singularity"),
         ("late", 0.25, 0.26, "0.26 s old"),
-        ("rate", 24.0, 23.0, "23.0 pictures a second instead of 30"),
+        ("rate", 24.0, 23.0, "23.0 images a second instead of 30"),
         ("counts", 11.9, 12.1, "looks touched (12 counts)"),
         ("disk", 1.551e9, 1.549e9, "make room for 1.6 GB"),  # 500 MB, and 35 MB for each of 30 s
     ],

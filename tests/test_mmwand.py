@@ -92,8 +92,8 @@ def test_words_are_added_to_an_encoder_that_stays_as_it_is(
     command += " --heads.epochs 100 --backgrounds generated"
     assert main(command.split()) in (0, None)
     worded, plain = load_encoder(tmp_path / "run/encoder"), load_encoder("gelsight_mini")
-    picture = np.random.default_rng(0).integers(0, 255, (2, 240, 320, 3), dtype=np.uint8)
-    np.testing.assert_allclose(worded.embed(picture), plain.embed(picture), atol=2e-3)
+    image = np.random.default_rng(0).integers(0, 255, (2, 240, 320, 3), dtype=np.uint8)
+    np.testing.assert_allclose(worded.embed(image), plain.embed(image), atol=2e-3)
     assert worded.towers == "offline" and isinstance(worded, PooledEncoder)
     words = worded.embed_text_goal(["a hard object", "a soft object"], load_towers("offline"))
     images = worded.project_image(torch.rand(3, worded.config.image_dim)).numpy()
@@ -129,24 +129,24 @@ def write_table(path: Path, *rows: tuple[object, ...]) -> None:
         csv.writer(file).writerows(rows)
 
 
-def write_picture(path: Path, picture: np.ndarray) -> None:
+def write_image(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), picture.astype(np.uint8))
+    assert cv2.imwrite(str(path), image.astype(np.uint8))
 
 
 def test_objectfolder_real(tmp_path: Path) -> None:
     rows: list[tuple[object, ...]] = [("index", "name", "material")]
     materials = ("Steel", "Wood", "Steel", "")
     for i, material in enumerate(materials, 1):
-        picture = np.full((320, 240, 3), 100.0)
-        picture[:10, :, 2] = 40 * i  # red at the top
-        write_picture(tmp_path / "touch" / f"{i:03d}.png", picture)
+        image = np.full((320, 240, 3), 100.0)
+        image[:10, :, 2] = 40 * i  # red at the top
+        write_image(tmp_path / "touch" / f"{i:03d}.png", image)
         rows.append((i, f"object_{i}", material))
     write_table(tmp_path / "objects.csv", *rows)
-    write_picture(tmp_path / "picture" / "002.jpg", np.zeros((8, 8, 3)))
+    write_image(tmp_path / "picture" / "002.jpg", np.zeros((8, 8, 3)))
     objects = read_objectfolder_real(tmp_path)
     assert [item.material for item in objects] == ["steel", "wood", "steel", None]
-    assert [item.picture is not None for item in objects] == [False, True, False, False]
+    assert [item.image is not None for item in objects] == [False, True, False, False]
     touches, untouched = read_touches(objects)
     assert touches.shape == (4, 240, 320, 3) and touches[3, 0, 0, 0] == 160  # RGB, turned left
     assert untouched[0, 0, 0] == 100
@@ -165,21 +165,21 @@ def test_tvl(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         touched = np.full((24, 32, 3), 120.0) + rng.normal(0, 5, (24, 32, 3))
         touched[:, : 16 if i % 2 else 4] += 60
         if i < 8:
-            write_picture(ssvtp / f"images_rgb/image_{i}_rgb.jpg", touched)
-            write_picture(ssvtp / f"images_tac/image_{i}_tac.jpg", touched)
+            write_image(ssvtp / f"images_rgb/image_{i}_rgb.jpg", touched)
+            write_image(ssvtp / f"images_tac/image_{i}_tac.jpg", touched)
             (ssvtp / "text").mkdir(exist_ok=True)
             (ssvtp / "text" / f"labels_{i}.txt").write_text(felt[i % 2].capitalize() + ".\n")
             continue
         own = (f"vision/{i // 2}/{i}.jpg", f"tactile/{i // 2}/{i}.jpg", f"tactile/{i // 2}/bg.jpg")
         rows.append((*own, felt[i % 2]))
         for name in own[:2]:
-            write_picture(hct / name, touched)
+            write_image(hct / name, touched)
     urls = [(f"images_rgb/image_{i}_rgb.jpg",) for i in range(8)]
     write_table(ssvtp / "train.csv", ("url",), *urls[:6])
     write_table(ssvtp / "test.csv", ("url",), *urls[6:])
     write_table(hct / "train.csv", header, *rows)
     (hct / "contact.json").write_text(json.dumps({}))
-    write_picture(hct / "digit_background.png", np.full((24, 32, 3), 120.0))
+    write_image(hct / "digit_background.png", np.full((24, 32, 3), 120.0))
     touches = read_tvl(tmp_path)
     assert len(touches) == 24 and touches[0].words == ("smooth", "hard")
     assert touches[0].untouched is None and touches[0].press == "ssvtp/0"

@@ -15,7 +15,7 @@ from touchgoal.control.calibration.press_recorder import PressRecorder
 from touchgoal.control.calibration.press_set import read_presses
 from touchgoal.control.calibration.sensor_check import check_sensor
 from touchgoal.control.sensors.fingertip_source import open_frames, recorded_frames
-from touchgoal.control.sensors.live_picture import LivePicture
+from touchgoal.control.sensors.live_image import LiveImage
 from touchgoal.control.tactile.background import untouched_frames
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.gel_wear import find_wear
@@ -81,15 +81,15 @@ def test_a_gel_that_is_touched_first_is_waited_for(session: list[np.ndarray]) ->
 def test_record_presses_writes_what_is_calibrated(
     session: list[np.ndarray], tmp_path: Path
 ) -> None:
-    """A folder of pictures; then a second ball is added."""
-    pictures, out = tmp_path / "pictures", tmp_path / "out"
-    pictures.mkdir()
+    """A folder of images; then a second ball is added."""
+    images, out = tmp_path / "pictures", tmp_path / "out"
+    images.mkdir()
     for i, frame in enumerate(session):
-        cv2.imwrite(str(pictures / f"{i:04d}.png"), frame[..., ::-1])
+        cv2.imwrite(str(images / f"{i:04d}.png"), frame[..., ::-1])
     sizes = "--mm-per-pixel 0.059 --presses-per-part 1 --no-calibrate"
     options = [*sizes.split(), "--out", str(out)]
-    main(["record-presses", str(pictures), "--ball-mm", "4", *options])
-    main(["record-presses", str(pictures), "--ball-mm", "5", "--resume", *options])
+    main(["record-presses", str(images), "--ball-mm", "4", *options])
+    main(["record-presses", str(images), "--ball-mm", "5", "--resume", *options])
     presses = read_presses(out / "presses", 0.059e-3)
     assert len(presses) == 24
     assert sorted(set(presses.ball_radius.round(4))) == [4e-3, 5e-3]
@@ -110,9 +110,9 @@ def test_a_video_and_a_folder_give_every_frame(session: list[np.ndarray], tmp_pa
 
 
 def test_what_is_shown_live_can_be_read_live(session: list[np.ndarray]) -> None:
-    """The picture that record-presses shows is itself a stream such as live sensors send."""
+    """The image that record-presses shows is itself a stream such as live sensors send."""
     ended = threading.Event()
-    with closing(LivePicture(0)) as live:
+    with closing(LiveImage(0)) as live:
         live.show(session[0])
 
         def play() -> None:
@@ -134,8 +134,8 @@ def balls() -> list[np.ndarray]:
     flat, circles = np.zeros((240, 320), np.float32), [[x, 120.0, 22.0] for x in (100, 160, 220)]
     pressed = [press_surface(calibration, np.array(circle), 4e-3) for circle in circles]
     clean = [shade(calibration, surface) for surface in ([flat] * 12 + pressed + [flat] * 3)]
-    noisy = [picture + rng.normal(size=picture.shape) for picture in clean]
-    return [picture.round().clip(0, 255).astype(np.uint8) for picture in noisy]
+    noisy = [image + rng.normal(size=image.shape) for image in clean]
+    return [image.round().clip(0, 255).astype(np.uint8) for image in noisy]
 
 
 def test_the_start_of_a_clip_is_no_untouched_gel_by_itself(
@@ -173,12 +173,12 @@ def test_check_sensor_says_what_is_off(
     balls: list[np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Light that grows by a fifth on the way, a wrong ball, and a weight."""
-    pictures = tmp_path / "pictures"
-    pictures.mkdir()
+    images = tmp_path / "pictures"
+    images.mkdir()
     for i, frame in enumerate([*balls, *[balls[0]] * 90]):
         lit = np.rint(frame * (1 + 0.2 * min(i / 60, 1))).clip(0, 255)
-        cv2.imwrite(str(pictures / f"{i:03d}.png"), lit.astype(np.uint8)[..., ::-1])
-    main(["check-sensor", str(pictures), "--sensor", "gelsight_mini", "--ball-mm", "6",
+        cv2.imwrite(str(images / f"{i:03d}.png"), lit.astype(np.uint8)[..., ::-1])
+    main(["check-sensor", str(images), "--sensor", "gelsight_mini", "--ball-mm", "6",
           "--weight-g", "2000", "--out", str(tmp_path / "out"),
           *(["--rerun", str(tmp_path / "a.rrd")] if find_spec("rerun") else [])])  # fmt: skip
     if find_spec("rerun"):
@@ -201,7 +201,7 @@ def test_a_sensor_check_counts_markers() -> None:
     assert check.largest_shift_px == pytest.approx(3, abs=0.5)
 
 
-def test_a_darker_picture_has_a_depth(balls: list[np.ndarray]) -> None:
+def test_a_darker_image_has_a_depth(balls: list[np.ndarray]) -> None:
     """A surface below rest everywhere used to cast shadows of negative length."""
     estimator = DepthEstimator(load(GELSIGHT_MINI.sensor_file), 8)
     depth = estimator.estimate(np.rint(0.75 * balls[0]).astype(np.uint8), balls[0].astype("f4"))
@@ -212,16 +212,14 @@ def test_a_darker_picture_has_a_depth(balls: list[np.ndarray]) -> None:
 
 
 def look(instance: SensorInstance, rng: np.random.Generator) -> np.ndarray:
-    picture = render_untouched(instance, rng)
-    draw(picture, instance.markers, instance.marker_radius)
-    return picture
+    image = render_untouched(instance, rng)
+    draw(image, instance.markers, instance.marker_radius)
+    return image
 
 
-def drawn(
-    picture: np.ndarray, kind: str, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw a scratch, a hole in the coating or a dust grain; return the picture and the place (px)."""
-    h, w, _ = picture.shape
+def drawn(image: np.ndarray, kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw a scratch, a hole in the coating or a dust grain; return the image and the place (px)."""
+    h, w, _ = image.shape
     mask, at = np.zeros((h, w), np.uint8), rng.uniform([0.3 * w, 0.3 * h], [0.7 * w, 0.7 * h])
     middle = int(at[0]), int(at[1])
     if kind == "scratched":
@@ -233,12 +231,12 @@ def drawn(
     elif kind == "torn":
         axes = int(rng.integers(14, 40)), int(rng.integers(14, 30))
         cv2.ellipse(mask, middle, axes, rng.uniform(0, 180), 0, 360, 255, -1, cv2.LINE_AA)
-        change = 20 - picture.astype(float)
+        change = 20 - image.astype(float)
     else:
         cv2.circle(mask, middle, int(rng.integers(2, 5)), 255, -1, cv2.LINE_AA)
-        change = -0.5 * picture
+        change = -0.5 * image
     share = cv2.GaussianBlur(mask / 255.0, (0, 0), 0.7)[..., None]
-    return np.clip(picture + share * change, 0, 255).astype(np.uint8), at
+    return np.clip(image + share * change, 0, 255).astype(np.uint8), at
 
 
 @pytest.mark.parametrize(("name", "gels"), [("gelsight_mini", 20), ("gelsight_mini_markers", 8)])

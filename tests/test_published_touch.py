@@ -41,7 +41,7 @@ def test_slides_are_upright_digits_with_their_own_untouched_gel(tmp_path: Path) 
         assert near(frames[0], gel(100 * k + 23, light=light))
         assert near(background, np.full((320, 240, 3), UNTOUCHED[light]))
     for path in (tmp_path / "bgs").iterdir():
-        path.unlink()  # then a recording's usual picture is its background: bumps are nowhere twice
+        path.unlink()  # then a recording's usual image is its background: bumps are nowhere twice
     background = read_recordings(tmp_path)[0].open()[1]
     assert near(background, np.full((320, 240, 3), UNTOUCHED["red"]))
 
@@ -58,8 +58,8 @@ def test_touch_and_go_has_red_and_blue_put_back(tmp_path: Path) -> None:
     """The set's converter gave RGB to OpenCV's writer, which takes BGR."""
     clips = {f"2022041{i}_031604.pkl": 3 + i for i in range(4)}
     for name, count in clips.items():
-        pictures = [gel(t, (480, 640)) for t in range(count)]
-        stored = [cv2.imencode(".jpg", picture)[1].tobytes() for picture in pictures]
+        images = [gel(t, (480, 640)) for t in range(count)]
+        stored = [cv2.imencode(".jpg", image)[1].tobytes() for image in images]
         write(tmp_path / name, stored)
     recordings = read_recordings(tmp_path)
     assert {r.sensor for r in recordings} == {"gelsight_markers"}
@@ -82,7 +82,7 @@ def test_what_is_no_such_folder_is_one_line(tmp_path: Path) -> None:
         read_recordings(tmp_path)[1].open()[0].frames([0, 1])
 
 
-def test_strokes_have_their_pictures_forces_and_slips(tmp_path: Path) -> None:
+def test_strokes_have_their_images_forces_and_slips(tmp_path: Path) -> None:
     labels = write_force_batch(tmp_path / "sphere" / "batch_1", strokes=2)
     strokes = list(read_strokes(tmp_path))
     assert [s.name for s in strokes] == ["sphere/batch_1/0", "sphere/batch_1/1"]
@@ -118,7 +118,7 @@ def test_bags_have_motions_in_metres_and_radians(tmp_path: Path) -> None:
     assert [b.object for b in bags] == 2 * (2 * ["pringles"] + 2 * ["sugar"])
     assert [b.held_out for b in bags] == 4 * [False] + 4 * [True]
     bag = bags[0]
-    assert len(bag.clip) == len(bag.change) == 8  # one pose more than pictures
+    assert len(bag.clip) == len(bag.change) == 8  # one pose more than images
     assert bag.change[6] == pytest.approx([0.6e-3, -1.2e-3, np.radians(0.4)])
     assert near(bag.clip.frames([6])[0], gel(6)) and bag.clip.sensor == "digit"
     assert np.array_equal(bag.background(), np.full((320, 240, 3), UNTOUCHED["red"]))

@@ -153,20 +153,20 @@ def test_videos_of_other_objects_tell_what_differs_without_meaning() -> None:
     assert adapted_nearest_is_same(embeddings, shuffled).mean() < 0.15
 
 
-def dotted_picture(shift: float) -> np.ndarray:
+def dotted_image(shift: float) -> np.ndarray:
     """6 x 4 dots, 40 px apart and moved to the right; a dot of each row further."""
-    picture = np.full((200, 280), 160, np.uint8)
+    image = np.full((200, 280), 160, np.uint8)
     for row in range(4):
         for column in range(6):
             centre = (40 * column + 40 + shift * (2 if column == 2 else 1), 40 * row + 40)
-            cv2.circle(picture, [round(16 * c) for c in centre], 16 * 9, 20, -1, cv2.LINE_AA, 4)
-    return cv2.cvtColor(cv2.GaussianBlur(picture, (0, 0), 1.0), cv2.COLOR_GRAY2BGR)
+            cv2.circle(image, [round(16 * c) for c in centre], 16 * 9, 20, -1, cv2.LINE_AA, 4)
+    return cv2.cvtColor(cv2.GaussianBlur(image, (0, 0), 1.0), cv2.COLOR_GRAY2BGR)
 
 
 def test_markers_are_compared_with_another_trackers(tmp_path: Path) -> None:
     y, x = np.mgrid[40:200:40, 40:280:40].astype(float)
     for i, shift in enumerate((0.0, 4.0, -3.0, 5.5)):
-        cv2.imwrite(str(tmp_path / f"gel_{i}.png"), dotted_picture(shift))
+        cv2.imwrite(str(tmp_path / f"gel_{i}.png"), dotted_image(shift))
         tracked = x + shift + 0.5  # where its first pixel lies is its own affair
         tracked[:, 2] += shift
         if i == 3:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from in_process import in_process_workers
-from numbered_pictures import until
+from numbered_images import until
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.wand import WandReading
@@ -38,7 +38,7 @@ VIEWS = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.WAND_VIEWS]
 
 @pytest.fixture(scope="module")
 def ramp() -> np.ndarray:
-    """The gel's pictures at 0, 4, 8, 12, 16 and 20 N."""
+    """The gel's images at 0, 4, 8, 12, 16 and 20 N."""
     env = TouchWand(object="screw", views=False)
     env.reset(seed=3)
     touch = None
@@ -77,8 +77,8 @@ class Person(threading.Thread):
             self._obey(["", *self.lines][-1])
             force = max(self._force, 0.0)
             pressed = self.ramp[int(np.ceil(force / MAX_FORCE * 5))]
-            picture = pressed + self._rng.normal(0, 1, pressed.shape)
-            self.streams["gel"].publish(np.clip(picture, 0, 255).astype(np.uint8))
+            image = pressed + self._rng.normal(0, 1, pressed.shape)
+            self.streams["gel"].publish(np.clip(image, 0, 255).astype(np.uint8))
             light = 160 if force > 0 else 60
             for name in VIEWS:
                 view = light + self._rng.normal(0, 3, (64, 80, 3))
@@ -149,7 +149,7 @@ def test_three_touches_are_recorded_as_the_twins_and_ctrl_c_loses_nothing(
     assert load[0] == 0 and (np.diff(load) > 0).all() and load[-1] == pytest.approx(forces[0])
     view = frames[ft.WAND_VIEWS[0]].mean((1, 2, 3))
     np.testing.assert_allclose(view, [60, 60, 160, 160, 160, 160], atol=3)
-    untouched, touched = WandSet.open(found.root).pictures(2)
+    untouched, touched = WandSet.open(found.root).images(2)
     assert np.abs(untouched.astype(float) - person.ramp[0]).mean() < 2
     assert np.abs(touched.astype(float) - untouched).max() > 20
 
@@ -204,16 +204,14 @@ class Hand:
         self._ramp, self._rng = ramp, np.random.default_rng(0)
 
     def feel(self, *forces: float, shown: float | None = None) -> list[WandTouch | str]:
-        """Return the touches, and why others do not count; `shown`: force that the picture shows."""
+        """Return the touches, and why others do not count; `shown`: force that the image shows."""
         made = []
         for force in forces:
             seen = min(force, MAX_FORCE) if shown is None else shown
-            picture = self._ramp[int(np.ceil(seen / 4))] + self._rng.normal(0, 1, (240, 320, 3))
-            picture[100:102, 60:160] += self.scratch
+            image = self._ramp[int(np.ceil(seen / 4))] + self._rng.normal(0, 1, (240, 320, 3))
+            image[100:102, 60:160] += self.scratch
             view = {"top": np.full((2, 2, 3), int(force > 0), np.uint8)}
-            reading = WandReading(
-                np.clip(picture, 0, 255).astype(np.uint8), view, float(force) + 0.4
-            )
+            reading = WandReading(np.clip(image, 0, 255).astype(np.uint8), view, float(force) + 0.4)
             made.append(self.recorder.update(reading))
         return [one for one in made if one is not None]
 

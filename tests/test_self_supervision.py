@@ -145,8 +145,8 @@ def test_a_collapsed_training_saves_nothing(
 
 def test_moments_hold_the_true_past(tmp_path: Path) -> None:
     greys = 16 * np.arange(6, dtype=np.uint8)[:, None, None, None]
-    pictures = np.broadcast_to(greys, (6, 240, 320, 3)).copy()
-    columns = {key: pictures for key in ft.TACTILE} | {ft.ACTION: np.zeros((6, 8), np.float32)}
+    images = np.broadcast_to(greys, (6, 240, 320, 3)).copy()
+    columns = {key: images for key in ft.TACTILE} | {ft.ACTION: np.zeros((6, 8), np.float32)}
     EpisodeWriter(tmp_path).append(Episode(columns, "feel"))
     moments = sample_frames(EpisodeSet(tmp_path), SENSOR, 6, 0, (0, 2, 4))
     assert moments.touch.shape == (12, 3, 3, 120, 160) and moments.stride == 2

@@ -94,7 +94,7 @@ def test_a_wrong_file_is_refused_with_the_keys_that_do_not_fit(tmp_path: Path) -
 UPRIGHT, SQUARE = (320, 240), (224, 224)
 SQUARES = {"layer_scale": False, "stored": 196}
 CLIPS = {"channels": 3, "tubelet": 2, "layer_scale": False, "stored": 392}
-# What the weights are, the names a training gives them, the size of their pictures, and how many frames
+# What the weights are, the names a training gives them, the size of their images, and how many frames
 # before the newest each one lies.
 METHODS: dict[str, tuple[dict[str, Any], str, tuple[int, int], tuple[int, ...]]] = {
     "mae": ({}, "encoder.", UPRIGHT, (0, 5)),
@@ -147,7 +147,7 @@ def test_raw_frames_give_the_published_features(tmp_path: Path, method: str) -> 
     for i in (0, 3, 8):
         np.testing.assert_allclose(found[i], expected(weights, frames, i, method), atol=2e-5)
     single = encoder.embed(frames[3], background=frames[0])
-    alone = np.stack([frames[0], *[frames[3]] * 8])  # a single picture is its own past
+    alone = np.stack([frames[0], *[frames[3]] * 8])  # a single image is its own past
     np.testing.assert_allclose(single, expected(weights, alone, 8, method), atol=2e-5)
 
 
@@ -167,7 +167,7 @@ def test_options_and_a_folder_of_ours(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.encoder.embed(both), encoder.embed(both))
 
 
-def test_pictures_of_any_sensor_become_upright_four_by_three(tmp_path: Path) -> None:
+def test_images_of_any_sensor_become_upright_four_by_three(tmp_path: Path) -> None:
     save_file(published(), tmp_path / "mae_vittiny.safetensors")
     preprocess = load_encoder(tmp_path).preprocess
     lying = video(3, (48, 100))[2:]  # 64 columns about the centre are 4:3

@@ -44,11 +44,11 @@ def spots(count: int) -> Placements:
     places = torch.stack([torch.randperm(25, generator=torch_rng(i))[:3] for i in range(count)])
     places = torch.stack([places // 5, places % 5], 2) * 6 + 4
     objects = 1 + torch.arange(count) % 2
-    pictures = torch.full((count, 32, 32, 3), 128, dtype=torch.uint8)
-    for picture, place, n in zip(pictures, places, objects, strict=True):
+    images = torch.full((count, 32, 32, 3), 128, dtype=torch.uint8)
+    for image, place, n in zip(images, places, objects, strict=True):
         colours = [*list(SPOTS.values())[:n], (0, 255, 0)]
         for colour, (row, column) in zip(colours, [*place[:n], place[2]], strict=True):
-            picture[row - 1 : row + 2, column - 1 : column + 2] = torch.tensor(colour)
+            image[row - 1 : row + 2, column - 1 : column + 2] = torch.tensor(colour)
     start = torch.zeros(count, 2, 7)
     start[..., 3] = 1.0
     start[..., :2], start[..., 5:] = places[:, :2] / 100, places[:, 2:] / 100
@@ -57,7 +57,7 @@ def spots(count: int) -> Placements:
     sentence[objects == 1, 1] = -1
     pixels = {ft.FRONT: places.float()}
     named = tuple(f"the {colour} spot" for colour in SPOTS)
-    return Placements({ft.FRONT: pictures}, tcp, start, pixels, objects, sentence, named)
+    return Placements({ft.FRONT: images}, tcp, start, pixels, objects, sentence, named)
 
 
 def test_contact_is_the_simulators_in_every_tick() -> None:
@@ -114,10 +114,10 @@ def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.Mo
 def test_a_hand_tilted_by_a_thousandth_changes_no_estimate() -> None:
     """In training it never is, and inverse kinematics leaves 1e-9: no information, but a small unit."""
     network = load_pose_estimator(SHIPPED_POLICIES["pick-place"] / ESTIMATOR)
-    pictures = {ft.FRONT: torch.full((1, 256, 256, 3), 90, dtype=torch.uint8)}
+    images = {ft.FRONT: torch.full((1, 256, 256, 3), 90, dtype=torch.uint8)}
     hand, words = torch.tensor([[0.45, 0, 0.26, 0, 1, 0, 0]]), torch.zeros(1, WORDS_WIDTH)
     tilted = hand + torch.tensor([[0, 0, 0, 1e-3, 0, 0, 1e-3]])
-    torch.testing.assert_close(network(pictures, tilted, words), network(pictures, hand, words))
+    torch.testing.assert_close(network(images, tilted, words), network(images, hand, words))
 
 
 def train_pose(
@@ -136,11 +136,11 @@ def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
     errors = pose_errors(sight, placements)
     assert errors["0 others"]["object_mm"][0] < 15 and errors["1 others"]["found"] > 0.9
     rows = placements.objects == 2
-    pictures = {ft.FRONT: placements.pictures[ft.FRONT][rows]}
+    images = {ft.FRONT: placements.images[ft.FRONT][rows]}
     tcp = placements.tcp[rows]
     for k, said in enumerate(("a red dot", "a blue dot")):
         words = embed([said]).expand(len(tcp), -1)
-        off = sight(pictures, tcp, words)[:, :2] - placements.start[rows, k, :2]
+        off = sight(images, tcp, words)[:, :2] - placements.start[rows, k, :2]
         assert off.norm(dim=1).median() < 0.02  # 0.12 by chance
 
 
@@ -164,7 +164,7 @@ def test_placements_say_where_each_object_is() -> None:
     for i, n in enumerate(placements.objects):
         assert (placements.sentence[i, n:] == -1).all()
         row, column = placements.pixels[ft.FRONT][i, -1].round().long()
-        red, green, blue = placements.pictures[ft.FRONT][i, row, column].tolist()
+        red, green, blue = placements.images[ft.FRONT][i, row, column].tolist()
         assert green > red and green > blue  # the disc
 
 

@@ -159,7 +159,7 @@ def test_encoders_are_judged(strokes: Path, tmp_path: Path, capsys: pytest.Captu
     assert shared_out == [row for row in result["rows"] if row["task"] == "slip"]
 
 
-def test_the_field_over_the_picture_adds_up_to_the_force() -> None:
+def test_the_field_over_the_image_adds_up_to_the_force() -> None:
     stroke, unit = simulate(RIG, 1), rig_unit(RIG)
     rows, columns = find_sensor(RIG.sensor).image_shape
     cell = rows * columns * unit.pixel_pitch**2 / 24**2

@@ -1,4 +1,4 @@
-"""Simulated tactile pictures: what they show, sensor by sensor; random surfaces and their encoder."""
+"""Simulated tactile images: what they show, sensor by sensor; random surfaces and their encoder."""
 
 import pickle
 from dataclasses import replace
@@ -136,7 +136,7 @@ def test_contact_appears_where_it_is() -> None:
 
 
 @pytest.mark.parametrize("squares", [False, True])
-def test_fast_picture_is_the_reference_formula_s(squares: bool) -> None:
+def test_fast_image_is_the_reference_formula_s(squares: bool) -> None:
     """Half the resolution and 1/16 count steps against the reference at full resolution."""
     frame = sense(Body(CATALOGUE["glass_ball"], (0.008,), 0.1), at=[4e-3, -3e-3, 0.007], force=6.0)
     calibration = INSTANCE.calibration

@@ -68,7 +68,7 @@ def test_torsion_turns_the_dots_the_way_the_object_turns() -> None:
 
 
 def test_an_object_is_seen_where_it_lies() -> None:
-    """The bulge around the bar changes, too, and draws its middle towards the picture's."""
+    """The bulge around the bar changes, too, and draws its middle towards the image's."""
     slide = simulate_slide(RigConfig(sensor="gelsight_mini", seed=5, load=(3.0, 3.0)), 0)
     h, w, _ = slide.frames.shape[1:]
     y, x = np.mgrid[:h, :w]

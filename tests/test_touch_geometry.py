@@ -139,7 +139,7 @@ def test_a_gel_without_its_markers_is_refused() -> None:
             find_markers(image, DOTS, MINI.pixel_pitch)
 
 
-@pytest.mark.parametrize("seed", [6, 56, 70])  # 70: dots a fifth larger in the picture
+@pytest.mark.parametrize("seed", [6, 56, 70])  # 70: dots a fifth larger in the image
 def test_dots_of_another_unit_are_painted_out_whole(seed: int) -> None:
     """Rims left over look like a touch, and `deploy` refuses."""
     unit = sample_instance(DOTTED, np.random.default_rng(seed))

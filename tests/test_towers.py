@@ -98,7 +98,7 @@ def test_images_embed_alike_in_any_batch(offline: OfflineTowers, photo: np.ndarr
     alone = torch.cat([offline.embed_images(crop[None]) for crop in crops])
     torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-4)
     assert F.cosine_similarity(together[0], together[3], dim=0) < 0.99
-    # More pictures than a batch go to threads of one core each; this thread's number stays.
+    # More images than a batch go to threads of one core each; this thread's number stays.
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     repeated = offline.embed_images(np.concatenate([crops] * 3))
@@ -184,8 +184,8 @@ def test_clip_from_a_directory(clip_directory: Path, photo: np.ndarray) -> None:
     images = clip.embed_images(photo[None, :200, :300])
     model = CLIPModel.from_pretrained(clip_directory)
     with torch.no_grad():
-        picture = Image.fromarray(photo[:200, :300]).resize((48, 32), Image.Resampling.BICUBIC)
-        square = torch.tensor(np.asarray(picture)[:, 8:40]).permute(2, 0, 1)[None] / 255
+        image = Image.fromarray(photo[:200, :300]).resize((48, 32), Image.Resampling.BICUBIC)
+        square = torch.tensor(np.asarray(image)[:, 8:40]).permute(2, 0, 1)[None] / 255
         mean, std = (
             torch.tensor(values)[:, None, None]
             for values in (CLIPImageProcessorPil.image_mean, CLIPImageProcessorPil.image_std)

@@ -233,7 +233,7 @@ def test_web_pages_and_nonsense_change_nothing_at_the_control_port(fr3: RunningT
     assert np.isfinite(truth["q"]).all() and truth["rest"] > 0
 
 
-def test_streams_that_have_sent_as_many_pictures_are_told_apart() -> None:
+def test_streams_that_have_sent_as_many_images_are_told_apart() -> None:
     """Comparing streams by value ended the rendering process."""
     streams = [Stream(clients=1) for _ in range(2)]
     for stream in streams:

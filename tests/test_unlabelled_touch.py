@@ -29,10 +29,10 @@ SPLITS = "train", "unlabelled", "val", "test"
 
 
 def press(brightness: int) -> np.ndarray:
-    """Nine pictures of a Mini: untouched five times, then with a square as bright as that."""
-    pictures = np.full((9, 60, 80, 3), 100, np.uint8)
-    pictures[5:, 20:40, 30:50] = brightness
-    return pictures
+    """Nine images of a Mini: untouched five times, then with a square as bright as that."""
+    images = np.full((9, 60, 80, 3), 100, np.uint8)
+    images[5:, 20:40, 30:50] = brightness
+    return images
 
 
 def write_videos(folder: Path, splits: tuple[str, ...] = SPLITS, brightness: int = 180) -> Path:
@@ -42,8 +42,8 @@ def write_videos(folder: Path, splits: tuple[str, ...] = SPLITS, brightness: int
         rows = csv.writer(file)
         rows.writerow("file object name split hardness roughness bumpiness".split())
         for split in splits:
-            pictures = press(20 if split in ("val", "test") else brightness)
-            write_video(folder / "videos" / f"{split}.mp4", pictures, 10)
+            images = press(20 if split in ("val", "test") else brightness)
+            write_video(folder / "videos" / f"{split}.mp4", images, 10)
             rows.writerow([f"{split}.mp4", split, split, split, "", "", ""])
     return folder
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numbered_pictures import BITS, numbered, until
+from numbered_images import BITS, numbered, until
 
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors import video
-from touchgoal.control.sensors.picture_integrity import FrozenParts
+from touchgoal.control.sensors.image_integrity import FrozenParts
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
     GELSIGHT_MINI_CROP,
@@ -43,7 +43,7 @@ def number(image: np.ndarray) -> int:
 
 
 class Streamer:
-    """A twin's stream of numbered pictures at 50 Hz."""
+    """A twin's stream of numbered images at 50 Hz."""
 
     def __init__(self, port: int = 0) -> None:
         self.stream, self.count, self.shape = Stream(), 0, (96, 128)
@@ -80,17 +80,17 @@ def test_a_slow_reader_sees_the_present(streamer: Streamer, camera: VideoCamera)
     assert camera.read().image.shape == (96, 128, 3)
     time.sleep(1.0)
     frame = camera.read()
-    # A queue would still hold the first pictures, 50 behind.
+    # A queue would still hold the first images, 50 behind.
     assert streamer.count - number(frame.image) < 20 < frame.sequence
     assert frame.image[80, 64, 0] > 140 > 60 > frame.image[80, 64, 2], "RGB, not BGR"
     assert frame.stamp <= time.monotonic()
     until(lambda: camera.problem == "")
 
 
-def test_a_frozen_picture_grows_old_and_is_said(streamer: Streamer, camera: VideoCamera) -> None:
+def test_a_frozen_image_grows_old_and_is_said(streamer: Streamer, camera: VideoCamera) -> None:
     camera.read()
     streamer.stream.frozen = np.inf
-    until(lambda: "one picture" in camera.problem)
+    until(lambda: "one image" in camera.problem)
     frozen = camera.read()
     time.sleep(0.2)
     assert camera.read().stamp == frozen.stamp and camera.read().sequence > frozen.sequence
@@ -99,16 +99,16 @@ def test_a_frozen_picture_grows_old_and_is_said(streamer: Streamer, camera: Vide
 
 
 @pytest.mark.parametrize(("fault", "says"), [("stalled", "last frame|gone"), ("halved", "broken")])
-def test_without_a_whole_new_picture_the_last_one_stays_and_it_is_said(
+def test_without_a_whole_new_image_the_last_one_stays_and_it_is_said(
     streamer: Streamer, camera: VideoCamera, fault: str, says: str
 ) -> None:
-    """FFmpeg would silently fill the rest of a picture cut in half from the one before."""
+    """FFmpeg would silently fill the rest of an image cut in half from the one before."""
     until(lambda: camera.problem == "")
     setattr(streamer.stream, fault, np.inf)
     until(lambda: bool(re.search(says, camera.problem)))
     last = camera.read()
     time.sleep(0.2)
-    assert camera.read() is last, "no new picture, so that ages tell"
+    assert camera.read() is last, "no new image, so that ages tell"
     setattr(streamer.stream, fault, 0.0)
     until(lambda: camera.read().sequence > last.sequence and camera.problem == "")
 
@@ -125,23 +125,23 @@ REAL = Path(__file__).parents[2] / "shared" / "data"  # beside the project; not 
 
 
 def noisy(seed: int, model: SensorModel = GELSIGHT_MINI) -> np.ndarray:
-    """A gel's picture, with dots (if it has some) that have moved by a few pixels."""
-    picture, rng = GEL.copy(), np.random.default_rng(seed)
+    """A gel's image, with dots (if it has some) that have moved by a few pixels."""
+    image, rng = GEL.copy(), np.random.default_rng(seed)
     if model.markers is not None:
         rest = rest_positions(model.markers, model.image_shape, model.pixel_pitch)
         moved = rest + rng.uniform(-6, 6, 2)
-        draw(picture, moved.astype(np.float32), model.markers.diameter / 2 / model.pixel_pitch)
-    return np.clip(picture + rng.normal(0, 1.5, GEL.shape), 0, 255).astype(np.uint8)
+        draw(image, moved.astype(np.float32), model.markers.diameter / 2 / model.pixel_pitch)
+    return np.clip(image + rng.normal(0, 1.5, GEL.shape), 0, 255).astype(np.uint8)
 
 
 def test_a_part_that_stands_still_counts_as_frozen_and_a_dark_part_does_not() -> None:
     parts = FrozenParts()
     for k in range(60):
-        picture = noisy(k)
-        picture[-40:] = 0  # never lit: tells nothing
+        image = noisy(k)
+        image[-40:] = 0  # never lit: tells nothing
         if k >= 40:
-            picture[120:180] = noisy(39)[120:180]
-        since = parts.update(picture, k / 30)
+            image[120:180] = noisy(39)[120:180]
+        since = parts.update(image, k / 30)
         assert since == pytest.approx((39 if k >= 40 else k) / 30, abs=1e-9)
 
 
@@ -160,7 +160,7 @@ def test_a_fingertip_is_cut_turned_and_scaled(tmp_path: Path) -> None:
     seen = crop_to_sensor(whole, GELSIGHT_MINI, GELSIGHT_MINI_CROP)
     assert seen.shape == (240, 320, 3) and (seen[1:-1, 1:-1] == (10, 200, 30)).all()
     lying = np.zeros((240, 320, 3), np.uint8)
-    lying[:, -1] = 255  # its right edge is the top of the upright picture
+    lying[:, -1] = 255  # its right edge is the top of the upright image
     assert crop_to_sensor(lying, DIGIT, DIGIT_CROP).shape == (320, 240, 3)
     assert (crop_to_sensor(lying, DIGIT, DIGIT_CROP)[0] == 255).all()
     with pytest.raises(UserError, match="quarter_turns"):
@@ -218,7 +218,7 @@ def test_a_fingertips_view_is_chosen_by_its_model_for_a_device_too() -> None:
 
 
 class PluggedCamera:
-    """OpenCV's capture of a camera that gives one picture and is then unplugged."""
+    """OpenCV's capture of a camera that gives one image and is then unplugged."""
 
     def __init__(self, keeps: float = 0.0) -> None:
         self.set_to: dict[int, float] = {}

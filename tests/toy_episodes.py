@@ -18,8 +18,8 @@ def moving_blob(n: int, height: int, width: int, seed: int) -> np.ndarray:
     centre = width * (0.2 + 0.6 * np.arange(n)[:, None, None] / n)
     blob = np.exp(-((x - centre) ** 2 + (y - height / 2) ** 2) / (0.02 * width * height))
     red, green, blue = np.random.default_rng(seed).uniform(20, 120, 3)
-    picture = np.stack([red + 100 * blob, green + 60 * blob, blue + 0 * blob], axis=-1)
-    return picture.astype(np.uint8)
+    image = np.stack([red + 100 * blob, green + 60 * blob, blue + 0 * blob], axis=-1)
+    return image.astype(np.uint8)
 
 
 def make_episode(seed: int, n: int = 7) -> Episode:

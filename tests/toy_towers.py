@@ -26,7 +26,7 @@ class PaintTowers:
 
 
 class TogetherTowers(PaintTowers):
-    """Towers whose pictures and sentences share a space, as a CLIP's."""
+    """Towers whose images and sentences share a space, as a CLIP's."""
 
     text_dim = 48
     pretrained_together = True

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from touchgoal.encoders.annotation.boxes import Box, Detection, Image
-from touchgoal.runtime.picture_file import read_picture
+from touchgoal.runtime.image_file import read_image
 
 COLOURS = {"red ball": (210, 40, 40), "green cup": (40, 190, 60), "blue box": (50, 70, 220)}
 SENSOR = 26  # px
@@ -92,12 +92,12 @@ def draw_camera(scene: Scene, frame: int, table: Image, patch: Image) -> Image:
 
 def draw_touch(scene: Scene, frame: int, gel: Image, rng: np.random.Generator) -> Image:
     """A dent that is deepest in the frame CONTACT."""
-    picture = gel + rng.normal(0, 1.0, gel.shape)
+    image = gel + rng.normal(0, 1.0, gel.shape)
     depth = 0 if scene.fault == "no touch" else max(0.0, 1 - abs(frame - CONTACT) / 2)
     y, x = np.mgrid[: gel.shape[0], : gel.shape[1]]
     dent = np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / (2 * 8**2))
-    picture += depth * 40 * dent[:, :, None] * np.array([1, -0.5, 0.7])
-    return picture.clip(0, 255).round().astype(np.uint8)
+    image += depth * 40 * dent[:, :, None] * np.array([1, -0.5, 0.7])
+    return image.clip(0, 255).round().astype(np.uint8)
 
 
 def write_png(path: Path, image: Image) -> None:
@@ -137,9 +137,9 @@ class KnownBoxes:
         self._scene_of = {}
         for scene in scenes:
             for path in (root / Path(scene.contact_image).parent).iterdir():
-                picture = read_picture(path)
-                assert picture is not None
-                self._scene_of[picture.tobytes()] = scene, int(path.stem[-4:])
+                image = read_image(path)
+                assert image is not None
+                self._scene_of[image.tobytes()] = scene, int(path.stem[-4:])
 
     def detect(self, image: Image, prompt: str) -> list[Detection]:
         scene, frame = self._scene_of[image.tobytes()]

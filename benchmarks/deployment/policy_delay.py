@@ -34,7 +34,7 @@ _PARTS = {  # parts of `--env.as-deployed`
     "lag, limits and tracker": ("tracker",),
     "a Franka Hand": ("franka_hand",),
     "an estimated wrench": ("estimated_wrench",),
-    "late states and pictures": ("state_delay", "picture_delay", "picture_rate", "jitter"),
+    "late states and pictures": ("state_delay", "image_delay", "image_rate", "jitter"),
     "late commands": ("command_delay",),
     "late plans": ("plan_ticks",),
 }
@@ -54,9 +54,9 @@ def _delays(config: Config) -> Iterator[tuple[str, bool, DeploymentConfig]]:
             for delay in config.delay:
                 half = (delay / 2000, delay / 2000)  # s: before the policy, and after it
                 more = (jitter / 1000, jitter / 1000)
-                late = DeploymentConfig(state_delay=half, picture_delay=half, command_delay=half)
+                late = DeploymentConfig(state_delay=half, image_delay=half, command_delay=half)
                 what = f"{delay:.0f} ms, jitter {jitter:.0f} ms, pictures {rate:.0f} Hz"
-                yield what, True, replace(late, jitter=more, picture_rate=rate)
+                yield what, True, replace(late, jitter=more, image_rate=rate)
 
 
 def _causes() -> Iterator[tuple[str, bool, DeploymentConfig]]:

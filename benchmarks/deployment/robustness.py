@@ -19,12 +19,12 @@ from touchgoal.sim_envs.scene.wires import HELD_OUT
 _LIGHT = {
     f"light {change:+.0%}": {"light_change": (change,)} for change in (-0.15, -0.05, 0.1, -0.8)
 }
-_DELAYED = {  # state and pictures; at 20 Hz a tick is 50 ms; learned policies go slower
-    f"{ticks} ticks late": {"state_delay": (s, s), "picture_delay": (s, s)}
+_DELAYED = {  # state and images; at 20 Hz a tick is 50 ms; learned policies go slower
+    f"{ticks} ticks late": {"state_delay": (s, s), "image_delay": (s, s)}
     for ticks, s in ((2, 0.1), (4, 0.2))
 }
 _LONGER = 1.5  # factor on the time limit of an episode with late or frozen observations
-_FROZEN = {"every second picture frozen": {"picture_rate": 10.0}}
+_FROZEN = {"every second picture frozen": {"image_rate": 10.0}}
 _CHANGES: dict[SimulatedTask, dict[str, dict[str, Any]]] = {
     "pick-place": {
         **_LIGHT,

@@ -77,9 +77,9 @@ def _free_running(plan: Plan, batch: ObservationBatch, control_hz: int) -> Float
         mujoco.mju_mat2Quat(quaternion, R.ravel())  # as the environment's observation
         now[18:22] = torch.from_numpy(quaternion)
         states = [*(states or [now] * horizon)[1:], now]
-        pictures = None if batch.pictures is None else batch.pictures[i : i + 1]
+        images = None if batch.images is None else batch.images[i : i + 1]
         maps = None if batch.maps is None else batch.maps[i : i + 1]
-        observed = ObservationBatch(touch[None], torch.stack(states)[None], pictures, maps)
+        observed = ObservationBatch(touch[None], torch.stack(states)[None], images, maps)
         action = plan(observed)[0, 0, :7].numpy()
         velocity = action * control_hz
         joints = joints + action

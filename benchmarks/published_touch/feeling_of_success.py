@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.published_touch.labels import booleans, entry
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
-from touchgoal.episodes.importers.touch_clip import TouchClip, encoded_pictures
+from touchgoal.episodes.importers.touch_clip import TouchClip, encoded_images
 from touchgoal.runtime.errors import UserError
 
 MOMENTS = ("before", "during", "after")
@@ -59,7 +59,7 @@ def _read(path: Path) -> Iterator[GraspTrial]:
     held = booleans(_plain(entry(value, "is_gripping", str(path))), f"'is_gripping' of {path}")
     names = _plain(entry(value, "object_name", str(path)))
     columns = {
-        (finger, moment): encoded_pictures(entry(value, key, str(path)), f"'{key}' of {path}")
+        (finger, moment): encoded_images(entry(value, key, str(path)), f"'{key}' of {path}")
         for finger in "AB"
         for moment in MOMENTS
         for key in [f"gelsight{finger}_{moment}"]

@@ -24,12 +24,12 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 
 from benchmarks.published_touch.labels import booleans, entry, numbers, whole_numbers
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
-from touchgoal.episodes.importers.touch_clip import TouchClip, check_sensor, read_pictures
+from touchgoal.episodes.importers.touch_clip import TouchClip, check_sensor, read_images
 from touchgoal.runtime.errors import UserError
 
 STRIDE = 5  # number of images between the two of a pair: 83 ms at a DIGIT's 60 Hz
 _LABELS = "dataset_slip_forces.pkl"
-_PICTURES = re.compile(r"dataset_(digit|gelsight)_\d+\.pkl")
+_IMAGES = re.compile(r"dataset_(digit|gelsight)_\d+\.pkl")
 _KINDS = {"digit": ("digit",), "gelsight": ("gelsight_mini", "gelsight_mini_markers")}
 _MOST_NAME = 40
 _MOST_FORCE = 100.0  # N: the load cell, an ATI Nano17, ends at 70
@@ -74,31 +74,31 @@ def read_strokes(folder: Path, sensor: str | None = None) -> Iterator[ForceStrok
 
 
 def _shards(batch: Path) -> list[Path]:
-    return sorted(path for path in batch.glob("dataset_*.pkl") if _PICTURES.fullmatch(path.name))
+    return sorted(path for path in batch.glob("dataset_*.pkl") if _IMAGES.fullmatch(path.name))
 
 
 def _read_batch(batch: Path, sensor: str | None) -> Iterator[ForceStroke]:
     shards = _shards(batch)
-    kinds = {match[1] for path in shards if (match := _PICTURES.fullmatch(path.name))}
+    kinds = {match[1] for path in shards if (match := _IMAGES.fullmatch(path.name))}
     if len(kinds) != 1:
         what = "images of two sensors" if kinds else "no images (dataset_digit_00.pkl)"
         raise UserError(f"{batch} holds {what}: get it again, as published")
     if not (batch / _LABELS).is_file():
         raise UserError(f"{batch / _LABELS} is missing, which labels the images beside it")
     named = check_sensor(sensor, _KINDS[kinds.pop()], batch)
-    pictures = [picture for path in shards for picture in read_pictures(path)]
+    images = [image for path in shards for image in read_images(path)]
     labels = read_plain_pickle(batch / _LABELS)
     name = str(batch / _LABELS)
     touched = booleans(entry(labels, "in_contact", name), f"'in_contact' of {name}")
-    if len(touched) != len(pictures):
+    if len(touched) != len(images):
         raise UserError(
-            f"{batch} holds {len(pictures)} images, {_LABELS} labels {len(touched)}: get all its files"
+            f"{batch} holds {len(images)} images, {_LABELS} labels {len(touched)}: get all its files"
         )
     if touched.all():
         raise UserError(f"no image in {batch} is labelled as without contact: get it again")
     untouched = np.flatnonzero(~touched)
-    clip = _with_true_colours(TouchClip(str(batch), named, pictures), int(untouched[0]))
-    strokes = list(_trajectories(labels, name, len(pictures)))
+    clip = _with_true_colours(TouchClip(str(batch), named, images), int(untouched[0]))
+    strokes = list(_trajectories(labels, name, len(images)))
     pressed = np.concatenate([force[:, 2] for _, _, force, _ in strokes] or [np.zeros(0)])
     into_gel = np.array([1.0, 1.0, -1.0 if pressed.sum() < 0 else 1.0])
     probe = re.sub(r"\d+$", "", batch.resolve().parent.name)
@@ -108,7 +108,7 @@ def _read_batch(batch: Path, sensor: str | None) -> Iterator[ForceStroke]:
         yield ForceStroke(title, probe, clip, rows, force * into_gel, slip, int(last))
 
 
-def _trajectories(labels: Any, name: str, pictures: int) -> Iterator[tuple[str, Any, Any, Any]]:
+def _trajectories(labels: Any, name: str, images: int) -> Iterator[tuple[str, Any, Any, Any]]:
     trajectories = entry(labels, "trajectories", name)
     if not isinstance(trajectories, dict) or not trajectories:
         raise UserError(
@@ -124,7 +124,7 @@ def _trajectories(labels: Any, name: str, pictures: int) -> Iterator[tuple[str, 
             f"forces {own}",
         )
         n = len(force)
-        rows = whole_numbers(entry(stroke, "indexes", own), pictures - 1, f"indexes {own}")
+        rows = whole_numbers(entry(stroke, "indexes", own), images - 1, f"indexes {own}")
         slip = booleans(entry(stroke, "slip_label", own), f"slip labels {own}")
         if len(rows) not in (n, n + STRIDE) or len(slip) < n:
             raise UserError(

@@ -20,11 +20,11 @@ from jaxtyping import Float64, UInt8
 
 from benchmarks.published_touch.labels import entry, numbers
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
-from touchgoal.episodes.importers.touch_clip import TouchClip, encoded_pictures, read_picture_file
+from touchgoal.episodes.importers.touch_clip import TouchClip, encoded_images, read_image_file
 from touchgoal.runtime.errors import UserError
 
 STRIDE = 5  # number of images over which a motion is measured
-_PICTURES = "digit_ring"  # the finger that the paper uses
+_IMAGES = "digit_ring"  # the finger that the paper uses
 _MILLIMETRE = 1e-3
 _MOST_SHIFT = 1000.0  # in the file's unit
 _OFF_ROTATION = 1e-2
@@ -45,7 +45,7 @@ class PoseBag:
 
     def background(self) -> UInt8[np.ndarray, "h w 3"]:
         """Read the image of the finger without contact."""
-        return read_picture_file(self.untouched, self.clip.sensor)
+        return read_image_file(self.untouched, self.clip.sensor)
 
 
 def read_bags(folder: Path) -> Iterator[PoseBag]:
@@ -58,15 +58,15 @@ def read_bags(folder: Path) -> Iterator[PoseBag]:
         raise UserError(
             f"{folder} holds no train/OBJECT/bag_00.pkl: give the folder of TacBench's pose estimation"
         )
-    untouched = folder / "bgs" / f"{_PICTURES}.png"
+    untouched = folder / "bgs" / f"{_IMAGES}.png"
     if not untouched.is_file():
         raise UserError(f"{untouched} is missing, which shows the ring finger without contact")
     for path in paths:
         bag = read_plain_pickle(path)
-        pictures = encoded_pictures(entry(bag, _PICTURES, str(path)), f"'{_PICTURES}' of {path}")
+        images = encoded_images(entry(bag, _IMAGES, str(path)), f"'{_IMAGES}' of {path}")
         change = _planar(entry(bag, f"object_ring_rel_pose_n{STRIDE}", str(path)), str(path))
-        count = min(len(pictures), len(change))
-        clip = TouchClip(str(path), "digit", pictures[:count])
+        count = min(len(images), len(change))
+        clip = TouchClip(str(path), "digit", images[:count])
         held_out = path.parent.parent.name == "test"
         yield PoseBag(str(path), path.parent.name, held_out, clip, change[:count], untouched)
 

@@ -1,8 +1,8 @@
 """Touch, Vision and Language (Fu et al., ICML 2024): SSVTP and HCT, DIGIT touches with captions.
 
-Published layout (github.com/Max-Fu/tvl): `ssvtp/{train,test}.csv` with a picture's path in the first
+Published layout (github.com/Max-Fu/tvl): `ssvtp/{train,test}.csv` with an image's path in the first
 column, `images_rgb/image_N_rgb.jpg`, `images_tac/image_N_tac.jpg`, `text/labels_N.txt`; and
-`hct/*/contact.json` beside `{train,test}.csv` with picture, touch, untouched sensor and caption in
+`hct/*/contact.json` beside `{train,test}.csv` with image, touch, untouched sensor and caption in
 four columns. Every test press of HCT has other frames in train, so the published split is not kept:
 hold presses out to be fair.
 """
@@ -21,11 +21,11 @@ _NUMBER = re.compile(r"image_(\d+)_rgb")
 
 @dataclass(frozen=True)
 class CaptionedTouch:
-    """One frame of a press, the camera picture taken with it, and what it feels like."""
+    """One frame of a press, the camera image taken with it, and what it feels like."""
 
-    picture: Path
+    image: Path
     touch: Path
-    untouched: Path | None  # picture of the sensor before the press; None in SSVTP
+    untouched: Path | None  # image of the sensor before the press; None in SSVTP
     words: tuple[str, ...]  # adjectives of the caption, lower case
     press: str  # frames with the same one are of one press
 
@@ -50,21 +50,21 @@ def read_tvl(folder: Path) -> list[CaptionedTouch]:
     ]
     if not touches:
         raise UserError(f"{folder} holds no train.csv with touches: unpack TVL there")
-    check_there((path for item in touches for path in (item.picture, item.touch)), folder)
+    check_there((path for item in touches for path in (item.image, item.touch)), folder)
     return touches
 
 
 def _ssvtp(root: Path, split: str) -> Iterator[CaptionedTouch]:
     for row in _rows(root / f"{split}.csv"):
-        picture = root / row[0]
-        if (found := _NUMBER.search(picture.name)) is None:
+        image = root / row[0]
+        if (found := _NUMBER.search(image.name)) is None:
             continue  # the header
         touch = root / row[0].replace("rgb", "tac")
         label = root / "text" / f"labels_{found[1]}.txt"
         if not label.is_file():
             raise UserError(f"{label} is missing: unpack TVL again")
         words = _words(label.read_text(encoding="utf-8").splitlines()[0])
-        yield CaptionedTouch(picture, touch, None, words, f"ssvtp/{found[1]}")
+        yield CaptionedTouch(image, touch, None, words, f"ssvtp/{found[1]}")
 
 
 def _hct(root: Path, split: str) -> Iterator[CaptionedTouch]:
@@ -73,12 +73,12 @@ def _hct(root: Path, split: str) -> Iterator[CaptionedTouch]:
         for row in _rows(table)[1:]:
             if len(row) != 4:
                 raise UserError(f"{table} has a row of {len(row)} columns; HCT's have 4")
-            picture, touch, untouched = (part / name for name in row[:3])
+            image, touch, untouched = (part / name for name in row[:3])
             if not untouched.is_file():  # as TVL's own reader does
                 untouched = untouched.parents[2] / "digit_background.png"
             press = str(touch.parent.relative_to(root.parent))
             yield CaptionedTouch(
-                picture, touch, untouched if untouched.is_file() else None, _words(row[3]), press
+                image, touch, untouched if untouched.is_file() else None, _words(row[3]), press
             )
 
 

@@ -53,7 +53,7 @@ def find_embedder(name: str, seed: int) -> Embedder:
         return _one_by_one(_embed_pixels)
     if name == "efficientnet":
         network = load_efficientnet_lite0()
-        return _of_pictures(lambda batch: network.features(imagenet_pixels(batch)))
+        return _of_images(lambda batch: network.features(imagenet_pixels(batch)))
     if name.startswith("random:"):
         return untrained(name.removeprefix("random:"), seed).embed_frames
     # Names on Hugging Face are OWNER/MODEL; ours have no slash, or are folders.
@@ -102,16 +102,16 @@ def _embed_pixels(frames: Frames, background: Untouched) -> Embeddings:
     return np.stack(small).reshape(len(frames), -1)
 
 
-def difference_pictures(frames: Frames, background: Untouched) -> Frames:
+def difference_images(frames: Frames, background: Untouched) -> Frames:
     """Return the change against the untouched image as an image about grey."""
     change = frames.astype(np.float32) - background
     return np.clip(128 + _CONTRAST * change, 0, 255).astype(np.uint8)
 
 
-def _of_pictures(network: Callable[[Frames], torch.Tensor]) -> Embedder:
+def _of_images(network: Callable[[Frames], torch.Tensor]) -> Embedder:
     @torch.no_grad()
     def embed(frames: Frames, background: Untouched) -> Embeddings:
-        return network(difference_pictures(frames, background)).float().numpy()
+        return network(difference_images(frames, background)).float().numpy()
 
     return _one_by_one(embed)
 
@@ -139,4 +139,4 @@ def _hugging_face(name: str) -> Embedder:
             pooled = tokens.mean((2, 3)) if tokens.ndim == 4 else tokens.mean(1)
         return pooled.flatten(1)
 
-    return _of_pictures(network)
+    return _of_images(network)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from benchmarks.options import BenchmarkOptions
 from benchmarks.published_touch.force_grasps import ForceGrasp, read_force_grasps
 from benchmarks.real_touch.embedders import Embedder, find_embedder
-from benchmarks.real_touch.picture_force import calibrate_force, change_statistics, resized
+from benchmarks.real_touch.image_force import calibrate_force, change_statistics, resized
 from benchmarks.real_touch.property_probe import interval
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector

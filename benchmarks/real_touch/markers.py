@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.options import BenchmarkOptions
-from benchmarks.published_touch.marker_pictures import (
-    MarkerPicture,
+from benchmarks.published_touch.marker_images import (
+    MarkerImage,
     has_markers,
-    read_marker_pictures,
+    read_marker_images,
 )
 from touchgoal.control.tactile.markers.tracker import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, MarkerGrid
@@ -38,18 +38,18 @@ def run(config: Config) -> dict[str, Any]:
     """Follow the dots of every series and compare."""
     if not has_markers(config.data):
         raise UserError(f"{config.data} has no SERIES_NUMBER.png with .json beside it")
-    result = judge_markers(read_marker_pictures(config.data)[:: config.every])
+    result = judge_markers(read_marker_images(config.data)[:: config.every])
     return {"table": marker_table(result), **result}
 
 
-def judge_markers(pictures: Sequence[MarkerPicture]) -> dict[str, Any]:
+def judge_markers(images: Sequence[MarkerImage]) -> dict[str, Any]:
     """Follow every series from its first image, and compare displacements.
 
     Positions would not do: each tracker has its own convention for the first pixel.
     """
-    series: dict[str, list[MarkerPicture]] = {}
-    for picture in pictures:
-        series.setdefault(picture.series, []).append(picture)
+    series: dict[str, list[MarkerImage]] = {}
+    for image in images:
+        series.setdefault(image.series, []).append(image)
     short = [name for name, own in series.items() if len(own) < 2]
     if short:
         raise UserError(f"{short[0]} is a single picture: nothing to follow")
@@ -59,7 +59,7 @@ def judge_markers(pictures: Sequence[MarkerPicture]) -> dict[str, Any]:
     ]
     moved, off, exchanged, lost = (np.concatenate(column) for column in zip(*followed, strict=True))
     return {
-        "frames": len(pictures),
+        "frames": len(images),
         "series": len(series),
         "dots": len(off),
         "near": float((off <= NEAR).mean()),
@@ -84,20 +84,20 @@ def marker_table(result: dict[str, Any]) -> str:
 
 
 def _follow(
-    first: MarkerPicture, others: Sequence[MarkerPicture]
+    first: MarkerImage, others: Sequence[MarkerImage]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return, for every dot of the other tracker: motion (px), difference (px), exchanged, lost."""
     grid, pixel_pitch = _grid(first.positions)
     tracker = MarkerTracker(first.frame(), grid, pixel_pitch)
     middle = (tracker.rest.positions - first.positions).mean((0, 1))
     rows = []
-    for picture in others:
-        now = tracker.update(picture.frame())
-        found = picture.found & first.found
-        theirs = picture.positions - first.positions
+    for image in others:
+        now = tracker.update(image.frame())
+        found = image.found & first.found
+        theirs = image.positions - first.positions
         off = np.linalg.norm(tracker.displacement - theirs, axis=-1)
         ours = (now.positions - middle).reshape(-1, 2)
-        apart = np.linalg.norm(ours[:, None] - picture.positions.reshape(-1, 2), axis=-1)
+        apart = np.linalg.norm(ours[:, None] - image.positions.reshape(-1, 2), axis=-1)
         other = (apart.argmin(1) != np.arange(len(ours))).reshape(found.shape)
         rows.append([x[found] for x in (np.linalg.norm(theirs, axis=-1), off, other, ~now.found)])
     moved, off, exchanged, lost = (np.concatenate(column) for column in zip(*rows, strict=True))

@@ -24,7 +24,7 @@ from benchmarks.real_touch.taxim_peer import (
 from touchgoal.control.calibration.calibrate import FittedCalibration, fit
 from touchgoal.control.calibration.press_fit import REGION
 from touchgoal.control.calibration.press_set import PressSet, split, write_presses
-from touchgoal.control.calibration.report import mean_errors, picture_errors, side_by_side
+from touchgoal.control.calibration.report import image_errors, mean_errors, side_by_side
 from touchgoal.runtime.errors import install_extra
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.runtime.progress import track
@@ -50,7 +50,7 @@ _TAXIM_LABELLED = {"gelsight": (2e-3, 0.4), "gelsight_mini": (3e-3, 0.0)}
 _TAXIM_MOVED = {"gelsight": (2e-3, 0.4), "gelsight_mini": (1e-3, 0.4)}
 _LEGEND = """corrected: labels corrected by a line fitted to the fitted presses, without the held-out
 picture; moved: circles fitted to the held-out picture"""
-_CUT = 120, 160  # rows and columns of an example in the picture
+_CUT = 120, 160  # rows and columns of an example in the image
 _EXAMPLES_PER_SENSOR = 2
 
 Colours = Float32[np.ndarray, "h w 3"]
@@ -70,15 +70,15 @@ def run(config: Config) -> dict[str, Any]:
             train, test = split(presses, N_TEST_PRESSES[sensor], seed)
             fitted = fit(train, PIXEL_PITCH, sensor)
             for method, simulated in _methods(sensor, fitted, train, test, taxim):
-                errors = mean_errors([*map(picture_errors, test.images, simulated, test.circles)])
+                errors = mean_errors([*map(image_errors, test.images, simulated, test.circles)])
                 rows.append({"sensor": sensor, "method": method, "seed": seed, **errors})
                 if method == MAIN_METHOD and seed == 0:
                     examples += _examples(test, simulated)
     lines = [_table(rows), _LEGEND]
     if not has_jax():
         lines.append(f"taxim's pictures are left out; to compare: {install_extra('peers')}")
-    picture = side_by_side([real for real, _ in examples], [made for _, made in examples])
-    return {"rows": rows, "table": "\n".join(lines), "pictures": {"pictures": picture}}
+    image = side_by_side([real for real, _ in examples], [made for _, made in examples])
+    return {"rows": rows, "table": "\n".join(lines), "pictures": {"pictures": image}}
 
 
 def _methods(
@@ -122,11 +122,11 @@ def _examples(test: PressSet, simulated: list[Colours]) -> list[tuple[Colours, C
     """Return the first presses, cut out around the contact, measured and simulated."""
     height, width = _CUT
     cuts = []
-    for image, picture, circle in zip(test.images, simulated, test.circles, strict=True):
+    for image, made, circle in zip(test.images, simulated, test.circles, strict=True):
         top = int(np.clip(circle[1] - height / 2, 0, image.shape[0] - height))
         left = int(np.clip(circle[0] - width / 2, 0, image.shape[1] - width))
         cut = slice(top, top + height), slice(left, left + width)
-        cuts.append((image[cut].astype(np.float32), picture[cut]))
+        cuts.append((image[cut].astype(np.float32), made[cut]))
     return cuts[:_EXAMPLES_PER_SENSOR]
 
 

@@ -63,7 +63,7 @@ class TaximRenderer:
         taxim: Any = importlib.import_module("taxim")
         calibration = getattr(taxim, f"CALIB_{sensor.upper()}")
         self._simulator = taxim.Taxim(calib_folder=calibration, backend="jax")
-        self.untouched = self._picture(np.full(_FULL_SHAPE, _UNTOUCHED_HEIGHT, np.float32))
+        self.untouched = self._image(np.full(_FULL_SHAPE, _UNTOUCHED_HEIGHT, np.float32))
 
     def render(
         self, circle: Circle, ball_radius: float, contact_share: float
@@ -73,9 +73,9 @@ class TaximRenderer:
         `contact_share` is the share of the deepest overlap at the circle: 0 where the ball cuts the
         flat gel, 0.4 where taxim's gel model comes loose from it.
         """
-        return self._picture(_ball_height(circle, ball_radius, contact_share))
+        return self._image(_ball_height(circle, ball_radius, contact_share))
 
-    def _picture(self, height: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2 3"]:
+    def _image(self, height: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2 3"]:
         full = 255 * np.asarray(self._simulator.render(height, with_shadow=True))
         rows, columns = _FULL_SHAPE
         size = columns // _DOWNSAMPLING, rows // _DOWNSAMPLING

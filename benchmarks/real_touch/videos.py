@@ -108,7 +108,7 @@ def embed_touch(
     chosen = embed(frames, touch.background, touch.chosen).mean(0)
     rest = frames[touch.rest][None]
     lit = np.rint(np.clip(rest * BRIGHTER, 0, 255)).astype(np.uint8)
-    alone = (embed(picture, touch.background)[0] for picture in (rest, lit))
+    alone = (embed(image, touch.background)[0] for image in (rest, lit))
     return VideoEmbedding(chosen, *alone)
 
 

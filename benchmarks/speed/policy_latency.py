@@ -91,8 +91,8 @@ def _stages(config: Config) -> list[Stage]:
     look = policy.end_to_end_encoder
     if policy.config.end_to_end is not None and look is not None:
         size = policy.config.end_to_end.size
-        pictures = [difference_images(ticks[1][k][None], ticks[0][k], size) for k in ft.TACTILE]
-        images = torch.from_numpy(np.stack(pictures, 1))
+        differences = [difference_images(ticks[1][k][None], ticks[0][k], size) for k in ft.TACTILE]
+        images = torch.from_numpy(np.stack(differences, 1))
         stages.append(_time("end-to-end encoder", config.repeats, lambda: look(images)))
     condition = torch.zeros(1, policy.condition_dim)
     generator = torch.Generator().manual_seed(0)
@@ -128,11 +128,11 @@ def _published(config: Config) -> list[Stage]:
 def _observations(config: PolicyConfig, camera: tuple[int, int]) -> list[dict[str, np.ndarray]]:
     rng = np.random.default_rng(0)
     keys = [key for key in config.proprioception if key not in config.estimated]
-    pictures = dict.fromkeys(ft.CAMERAS, (*camera, 3))
-    pictures |= {key: ft.FEATURES[key].shape for key in ft.TACTILE}
+    images = dict.fromkeys(ft.CAMERAS, (*camera, 3))
+    images |= {key: ft.FEATURES[key].shape for key in ft.TACTILE}
     return [
         {key: rng.normal(size=ft.FEATURES[key].shape).astype(np.float32) for key in keys}
-        | {key: rng.integers(90, 110, shape, np.uint8) for key, shape in pictures.items()}
+        | {key: rng.integers(90, 110, shape, np.uint8) for key, shape in images.items()}
         for _ in range(8)
     ]
 

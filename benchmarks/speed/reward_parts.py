@@ -38,12 +38,12 @@ def time_parts(repeats: int) -> dict[str, float]:
         "noise",
     )
     one = {key: value[:1] for key, value in frames.items()}
-    pressed, picture = one[TACTILE[0]], one[CAMERAS[0]]
-    maps = towers.embed_with_maps(picture)[1]
+    pressed, image = one[TACTILE[0]], one[CAMERAS[0]]
+    maps = towers.embed_with_maps(image)[1]
     value = Value(ValueConfig("", CAMERAS, "offline", maps.shape[1:], 0)).eval()
     stacked = torch.from_numpy(maps).float().flatten(2)[:, None].expand(-1, len(CAMERAS), -1, -1)
     work: dict[str, tuple[Callable[[], object], int]] = {
-        "a camera, pooled and at stride 16": (partial(towers.embed_with_maps, picture), 1),
+        "a camera, pooled and at stride 16": (partial(towers.embed_with_maps, image), 1),
         "touch of a fingertip": (partial(encoder.embed_frames, pressed, gel[0]), 1),
         "contact, force, centre and slip of a fingertip": (partial(reader.read, pressed), 1),
         "value of both cameras": (partial(value, stacked), 1),

@@ -1,4 +1,4 @@
-"""A ball pressed into a gel: contact circle in a picture, surface below, sphere in a depth map."""
+"""A ball pressed into a gel: contact circle in an image, surface below, sphere in a depth map."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from touchgoal.control.arrays import Circle, Map, Picture
+from touchgoal.control.arrays import Circle, Image, Map
 from touchgoal.control.tactile import gel
 from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration
@@ -51,7 +51,7 @@ def press_surface(calibration: SensorCalibration, circle: Circle, ball_radius: f
     return gel.deform(raw, calibration.pixel_pitch, calibration.blur_sigmas)
 
 
-def find_circle(image: Picture, background: Picture) -> Circle:
+def find_circle(image: Image, background: Image) -> Circle:
     """Find a ball's contact in RGB, to be moved by the fit: centre x, y and radius, px.
 
     UserError if no change from the untouched sensor stands out.
@@ -62,14 +62,14 @@ def find_circle(image: Picture, background: Picture) -> Circle:
     strongest = float(np.percentile(strength, 99.7))
     if strongest < _MIN_CHANGE:
         raise UserError(
-            f"no contact is visible ({strongest:.0f} counts of change): drop the picture, press "
+            f"no contact is visible ({strongest:.0f} counts of change): drop the image, press "
             "harder, or record background.png again"
         )
     disc = (strength > _DISC_SHARE * strongest).astype(np.uint8)
     disc = cv2.morphologyEx(disc, cv2.MORPH_OPEN, np.ones((7, 7), np.uint8))
     outlines, _ = cv2.findContours(disc, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not outlines:
-        raise UserError("the change is not a disc: drop the picture, or give its circle")
+        raise UserError("the change is not a disc: drop the image, or give its circle")
     (x, y), radius = cv2.minEnclosingCircle(max(outlines, key=cv2.contourArea))
     return np.array([x, y, _CONTACT_PER_DISC * radius])
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from touchgoal.control.arrays import Circle, Circles, Counts, Map, Picture
+from touchgoal.control.arrays import Circle, Circles, Counts, Image, Map
 from touchgoal.control.calibration import press_fit
 from touchgoal.control.calibration.ball import (
     DepthErrors,
@@ -30,8 +30,8 @@ STEPS = 5  # how often `fit` reports progress
 SQUARES_MINIMUM = 40
 """Least number of presses for `squares`; tested on 46 presses, up to six of them left out."""
 
-# Position terms need presses spread over the picture: the standard deviation of the centres, as a
-# share of the picture, in both directions (evenly spread over all of it: 0.29).
+# Position terms need presses spread over the image: the standard deviation of the centres, as a
+# share of the image, in both directions (evenly spread over all of it: 0.29).
 _MIN_SPREAD = 0.1
 _WINDOWS = (4.0, 8.0, 16.0, 32.0, 64.0)  # px
 _DEPTH_PRESSES = 12  # presses whose depth decides on the illumination exponent
@@ -43,8 +43,8 @@ class FittedCalibration:
     """Fitted sensor, with the circles of its presses."""
 
     calibration: SensorCalibration  # the sensor file
-    circles: Circles  # of the fitted presses, moved to their pictures, px
-    # of the fitted presses, m; unknown ones are fitted, but pictures determine them poorly
+    circles: Circles  # of the fitted presses, moved to their images, px
+    # of the fitted presses, m; unknown ones are fitted, but images determine them poorly
     ball_radius: Float[np.ndarray, " n"]
     varies_over_image: bool  # whether the response varies; not if all presses lie in one place
     # x, y and radius of the true circle (px) are about label_offset + label_slope * label
@@ -59,7 +59,7 @@ class FittedCalibration:
         return circles
 
     def fit_circles(self, presses: PressSet) -> Circles:
-        """Move the circles (px) of other presses from their labels to their pictures.
+        """Move the circles (px) of other presses from their labels to their images.
 
         Errors at these circles come from the model alone; errors at `correct_labels` include label
         errors.
@@ -165,7 +165,7 @@ def depth_errors(
     ]
 
 
-def median_background(presses: PressSet) -> Picture:
+def median_background(presses: PressSet) -> Image:
     """Return the background as the presses show it away from their contacts.
 
     A gel settles under the first presses, which leaves bands of several counts. Where fewer than
@@ -200,7 +200,7 @@ def _spread(change: Map, known: Bool[np.ndarray, "h w"]) -> Map:
 
 
 def _noise(presses: PressSet) -> float:
-    """Return the standard deviation (counts) of a pixel from one picture to the next."""
+    """Return the standard deviation (counts) of a pixel from one image to the next."""
     spreads = []
     for one, other in zip(presses.images[:-1], presses.images[1:], strict=True):
         change = (one.astype(np.float32) - other) / math.sqrt(2)

@@ -1,4 +1,4 @@
-"""Printed lines, metrics and picture of `check-sensor`."""
+"""Printed lines, metrics and image of `check-sensor`."""
 
 from dataclasses import asdict, fields
 from typing import Any
@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.calibration.sensor_check import PressReading, SensorCheck
 from touchgoal.control.tactile.background import Drift
-from touchgoal.control.tactile.picture_guard import UNEXPLAINED
+from touchgoal.control.tactile.image_guard import UNEXPLAINED
 
-_SHOWN = 4  # presses in the picture
+_SHOWN = 4  # presses in the image
 _CONTRAST = 4  # factor on the change in its column
 _GRAVITY = 9.81  # m/s^2
 _MARGIN = 2.0  # times the threshold that a usual touch should have
@@ -83,7 +83,7 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
     return printed
 
 
-def picture(check: SensorCheck) -> UInt8[np.ndarray, "H W 3"]:
+def image(check: SensorCheck) -> UInt8[np.ndarray, "H W 3"]:
     """Draw one row per press: frame, simulated frame, change of each times 4 about grey, depth."""
     rows = [_row(press, check.background) for press in check.presses[:_SHOWN]]
     return np.vstack(rows or [np.hstack([check.background] * 2)])
@@ -110,7 +110,7 @@ def _force(figures: dict[str, Any]) -> str:
     return line
 
 
-def _row(press: PressReading, background: Picture) -> np.ndarray:
+def _row(press: PressReading, background: Image) -> np.ndarray:
     drawn, simulated = (
         np.clip(128 + _CONTRAST * (frame.astype(np.float32) - background), 0, 255).astype(np.uint8)
         for frame in (press.frame, press.drawn)
@@ -133,7 +133,7 @@ def _contact(check: SensorCheck) -> str:
         return line + "; nothing touched"
     line += f", touches {check.touched:.1f}"
     if check.touched < _MARGIN * check.threshold:
-        line += ": a narrow margin; send pictures with less compression, or press harder"
+        line += ": a narrow margin; send images with less compression, or press harder"
     return line
 
 

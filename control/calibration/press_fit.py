@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64, Int
 
-from touchgoal.control.arrays import Circle, Circles, Picture
+from touchgoal.control.arrays import Circle, Circles, Image
 from touchgoal.control.calibration.ball import press_surface, squared_distance
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile.sensor_calibration import (
@@ -87,7 +87,7 @@ class PressFit:
     def __init__(
         self,
         presses: PressSet,
-        background: Picture,
+        background: Image,
         varies_over_image: bool,
         illumination_exponent: float,
         trust_labels: bool = False,
@@ -104,7 +104,7 @@ class PressFit:
     def initialise(
         self, initial: SensorCalibration, ball_radius: Float64[np.ndarray, " n"]
     ) -> FitState:
-        """Start with the common scale of the labelled radii that explains the pictures best.
+        """Start with the common scale of the labelled radii that explains the images best.
 
         An unknown ball (NaN) begins at twice the radius of the largest contact.
         """
@@ -132,7 +132,7 @@ class PressFit:
         return state
 
     def fit_common_scale(self, state: FitState) -> FitState:
-        """Scale all contacts and balls together if that explains the pictures better.
+        """Scale all contacts and balls together if that explains the images better.
 
         Scaling alone converges slowly: a weaker response to steeper slopes, or a wider bulge around
         a smaller contact, looks nearly the same.
@@ -145,7 +145,7 @@ class PressFit:
         return self._best(candidates)
 
     def fit_ball_radius(self, state: FitState) -> FitState:
-        """Select the ball radius (one for all presses) that explains the pictures best."""
+        """Select the ball radius (one for all presses) that explains the images best."""
         widest = state.circles[:, 2].max() * state.calibration.pixel_pitch
         balls = [np.full(len(state.circles), ratio * widest) for ratio in _BALLS_PER_CONTACT]
         return self._best([self.alternate(replace(state, ball_radius=ball), 2) for ball in balls])
@@ -158,7 +158,7 @@ class PressFit:
         return state
 
     def fit_circles(self, state: FitState) -> FitState:
-        """Move every circle towards its picture."""
+        """Move every circle towards its image."""
         everything = zip(state.circles, state.ball_radius, self._samples, self._labels, strict=True)
         moved = [self._refine_circle(state.calibration, *press) for press in everything]
         return replace(state, circles=np.stack(moved))
@@ -261,7 +261,7 @@ def move_circles(calibration: SensorCalibration, presses: PressSet, start: Circl
     return state.circles
 
 
-def _sample(image: Picture, background: Picture, circle: Circle) -> _Sample:
+def _sample(image: Image, background: Image, circle: Circle) -> _Sample:
     rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
     reach = REGION * circle[2]
     stride = max(1, round(math.sqrt(math.pi * reach**2 / _PIXELS)))

@@ -7,16 +7,16 @@ import cv2
 import numpy as np
 from jaxtyping import Int
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.calibration.ball import find_circle
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.interfaces import DriverError
-from touchgoal.control.sensors.live_picture import LivePicture
+from touchgoal.control.sensors.live_image import LiveImage
 from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.runtime.errors import UserError
 
-GRID = 3, 4  # rows and columns of the map of presses, of a picture that is wider than high
+GRID = 3, 4  # rows and columns of the map of presses, of an image that is wider than high
 _SETTLING = 15  # frames without a change, 0.6 s of a 25 Hz sensor, before the first press
 _STILL = 5  # frames in which a press must stand still
 _SETTLED = 1.0  # counts of local change between the medians of the first and of the last five
@@ -31,7 +31,7 @@ _SIDES = {
 
 
 class PressRecorder:
-    """Recorder of one picture per press: the first in which the ball stands still.
+    """Recorder of one image per press: the first in which the ball stands still.
 
     `shape` is that of the frames (rows, columns); `per_cell` is the number of presses wanted in each
     cell of the map.
@@ -40,15 +40,15 @@ class PressRecorder:
     def __init__(self, shape: tuple[int, int], per_cell: int = 2) -> None:
         self._shape, self._per_cell = shape, per_cell
         self.grid = GRID if shape[1] >= shape[0] else GRID[::-1]
-        self.images: list[Picture] = []
+        self.images: list[Image] = []
         self.circles: list[np.ndarray] = []  # as `find_circle` finds them, px
         self.hint = "leave the gel untouched"  # for the person who presses
-        self._recent = deque[Picture](maxlen=_SETTLING)
+        self._recent = deque[Image](maxlen=_SETTLING)
         self._detector: ContactDetector | None = None
         self._taken = False  # whether this contact is recorded
 
     @property
-    def background(self) -> Picture:
+    def background(self) -> Image:
         """Current untouched gel; UserError before it has settled."""
         if self._detector is None:
             raise UserError(
@@ -74,7 +74,7 @@ class PressRecorder:
         images, circles = np.stack(self.images), np.stack(self.circles)
         return PressSet(self.background, images, circles, np.full(len(images), ball_radius), names)
 
-    def update(self, frame: Picture) -> bool:
+    def update(self, frame: Image) -> bool:
         """Process the next frame and return whether it is recorded."""
         self._recent.append(frame)
         if self._detector is None:
@@ -94,23 +94,23 @@ class PressRecorder:
         self._taken = True
         return self._record(frame)
 
-    def draw_map(self, frame: Picture) -> Picture:
+    def draw_map(self, frame: Image) -> Image:
         """Draw the recorded circles and the count of each cell on a frame."""
         scale = max(1, round(640 / frame.shape[1]))
         size = frame.shape[1] * scale, frame.shape[0] * scale
-        picture = cv2.resize(frame, size, interpolation=cv2.INTER_NEAREST)
+        image = cv2.resize(frame, size, interpolation=cv2.INTER_NEAREST)
         rows, columns = self.grid
         for (row, column), count in np.ndenumerate(self.counts):
             left, top = column * size[0] // columns, row * size[1] // rows
             right, bottom = (column + 1) * size[0] // columns, (row + 1) * size[1] // rows
             colour = (0, 158, 115) if count >= self._per_cell else (213, 94, 0)
-            cv2.rectangle(picture, (left + 2, top + 2), (right - 3, bottom - 3), colour, 1)
-            _write(picture, f"{count}/{self._per_cell}", (left + 8, top + 20), colour)
+            cv2.rectangle(image, (left + 2, top + 2), (right - 3, bottom - 3), colour, 1)
+            _write(image, f"{count}/{self._per_cell}", (left + 8, top + 20), colour)
         for x, y, radius in self.circles:
             centre = round((x + 0.5) * scale), round((y + 0.5) * scale)
-            cv2.circle(picture, centre, round(radius * scale), (255, 255, 255), 1, cv2.LINE_AA)
-        _write(picture, self.hint, (8, size[1] - 10), (255, 255, 255))
-        return picture
+            cv2.circle(image, centre, round(radius * scale), (255, 255, 255), 1, cv2.LINE_AA)
+        _write(image, self.hint, (8, size[1] - 10), (255, 255, 255))
+        return image
 
     def _settle(self) -> None:
         recent = np.stack(self._recent)
@@ -125,7 +125,7 @@ class PressRecorder:
         self._detector = ContactDetector(Background(middle[None]))
         self.hint = f"press {self._where_next()}"
 
-    def _record(self, frame: Picture) -> bool:
+    def _record(self, frame: Image) -> bool:
         """Record a press and return whether it is fit; the hint says why not."""
         try:
             x, y, radius = find_circle(frame, self.background)
@@ -136,7 +136,7 @@ class PressRecorder:
         if radius < _SMALLEST:
             self.hint = "not recorded, too light: press harder"
         elif not (0 <= x < w and 0 <= y < h):
-            self.hint = "not recorded: the ball presses outside the picture"
+            self.hint = "not recorded: the ball presses outside the image"
         else:
             self.images.append(frame)
             self.circles.append(np.array([x, y, radius]))
@@ -153,7 +153,7 @@ class PressRecorder:
 
 
 def record_presses(
-    frames: Iterable[Picture], recorder: PressRecorder, live: LivePicture | None
+    frames: Iterable[Image], recorder: PressRecorder, live: LiveImage | None
 ) -> None:
     """Feed the recorder until its map is full, the frames end, the sensor is lost, or Ctrl-C."""
     hint = ""
@@ -173,8 +173,8 @@ def record_presses(
         print(f"ended: {error}")
 
 
-def _write(picture: Picture, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
+def _write(image: Image, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
     (x, y), black = at, (0, 0, 0)
-    cv2.rectangle(picture, (x - 3, y - height - 4), (x + width + 3, y + 5), black, cv2.FILLED)
-    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
+    cv2.rectangle(image, (x - 3, y - height - 4), (x + width + 3, y + 5), black, cv2.FILLED)
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)

@@ -8,34 +8,34 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from touchgoal.control.arrays import Circle, Circles, Picture, Pictures
+from touchgoal.control.arrays import Circle, Circles, Image, Images
 from touchgoal.control.calibration.ball import find_circle, squared_distance
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture, write_picture
+from touchgoal.runtime.image_file import read_image, write_image
 
 COLUMNS = ("file", "x_px", "y_px", "radius_px", "ball_mm")
 # Twelve are fitted and four held out. With fewer, the 30 response terms of a channel overfit single
 # presses. With twelve, the held-out error on GelSight is a tenth above that with 36.
 MINIMUM = 16
-# A pressed ball changes the picture by tens of counts. Camera noise is about 1 count (0.5 in the
+# A pressed ball changes the image by tens of counts. Camera noise is about 1 count (0.5 in the
 # mean of a few hundred pixels); slow drift of the light reached 7.
 _VISIBLE = 10.0
-_FAR = 3.0  # contact radii beyond which a press does not change the picture
+_FAR = 3.0  # contact radii beyond which a press does not change the image
 _LINE_ROUNDS, _LINE_TOLERANCE = 4, 1.0  # rounds and tolerance (counts) of the robust line
 
 
 @dataclass(frozen=True)
 class PressSet:
-    """Pictures of one ball pressed into one sensor."""
+    """Images of one ball pressed into one sensor."""
 
-    background: Picture  # the untouched sensor, RGB
-    images: Pictures  # the presses, RGB
+    background: Image  # the untouched sensor, RGB
+    images: Images  # the presses, RGB
     # contact circles as given or found: centre x (column), centre y (row) and radius, px; the
     # centre of the first pixel is (0, 0)
     circles: Circles
     ball_radius: Float[np.ndarray, " n"]  # m, one per press; all NaN if not known
-    files: tuple[str, ...]  # name of each picture
-    labelled: bool = True  # whether the circles were given, not found in the pictures
+    files: tuple[str, ...]  # name of each image
+    labelled: bool = True  # whether the circles were given, not found in the images
 
     def __len__(self) -> int:
         return len(self.images)
@@ -59,7 +59,7 @@ def split(presses: PressSet, n_held_out: int, seed: int) -> tuple[PressSet, Pres
 
 def write_presses(presses: PressSet, folder: Path, adds: bool = False) -> None:
     """Write the folder that `read_presses` reads, or add presses to it with a new background."""
-    write_picture(folder / "background.png", presses.background)
+    write_image(folder / "background.png", presses.background)
     with (folder / "presses.csv").open("a" if adds else "w", newline="") as file:
         rows = csv.writer(file)
         if file.tell() == 0:
@@ -67,15 +67,15 @@ def write_presses(presses: PressSet, folder: Path, adds: bool = False) -> None:
         for name, image, circle, ball in zip(
             presses.files, presses.images, presses.circles, presses.ball_radius, strict=True
         ):
-            write_picture(folder / name, image)
+            write_image(folder / name, image)
             known = "" if math.isnan(ball) else f"{ball * 1e3:g}"
             rows.writerow([name, *(f"{v:g}" for v in circle), known])
 
 
 def read_presses(folder: Path, pitch: float, ball_mm: float = math.nan) -> PressSet:
-    """Read `background.png`, `presses.csv` and the pictures it names, in the background's light.
+    """Read `background.png`, `presses.csv` and the images it names, in the background's light.
 
-    Without `presses.csv` every other picture is a press. Circles that the table lacks are found.
+    Without `presses.csv` every other image is a press. Circles that the table lacks are found.
     `pitch` is m per pixel; `ball_mm` is the radius (mm) of balls that the table does not give.
     UserError if something is missing, does not fit together, or is too little to calibrate from.
     """
@@ -109,8 +109,8 @@ def read_presses(folder: Path, pitch: float, ball_mm: float = math.nan) -> Press
         _check_visible(file, found, image, background)
         circles.append(found)
         images.append(without_drift(image, background, found))
-    pictures, contacts = np.stack(images), np.stack(circles)
-    return PressSet(background, pictures, contacts, ball, files, any(labelled))
+    stacked, contacts = np.stack(images), np.stack(circles)
+    return PressSet(background, stacked, contacts, ball, files, any(labelled))
 
 
 def _read_rows(folder: Path, ball_mm: float) -> list[tuple[str, Circle, float]]:
@@ -122,9 +122,9 @@ def _read_rows(folder: Path, ball_mm: float) -> list[tuple[str, Circle, float]]:
                 f"{path} is missing: give --ball-mm if one ball made all presses, or write one line "
                 "per press with the columns file,ball_mm (docs/own_sensor.md)"
             )
-        pictures = {p.name for p in folder.iterdir() if p.suffix.lower() in (".png", ".jpg")}
+        images = {p.name for p in folder.iterdir() if p.suffix.lower() in (".png", ".jpg")}
         unknown = np.full(3, math.nan)
-        return [(name, unknown, ball_mm) for name in sorted(pictures - {"background.png"})]
+        return [(name, unknown, ball_mm) for name in sorted(images - {"background.png"})]
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
         if "file" not in (reader.fieldnames or ()):
@@ -147,12 +147,12 @@ def _read_row(
     return row["file"], np.array([x, y, radius]), ball_mm if math.isnan(ball) else ball
 
 
-def _read_image(path: Path) -> Picture:
-    image = read_picture(path)
+def _read_image(path: Path) -> Image:
+    image = read_image(path)
     if image is None:
         raise UserError(
-            f"{path} is missing or no picture: a folder of presses needs background.png and the "
-            "pictures of the presses"
+            f"{path} is missing or no image: a folder of presses needs background.png and the "
+            "images of the presses"
         )
     return image
 
@@ -169,7 +169,7 @@ def _check_circle(
     if not (0 <= x < shape[1] and 0 <= y < shape[0]):
         raise UserError(
             f"presses.csv, {name}: the circle's centre ({x:g}, {y:g}) px lies outside the "
-            f"{shape[1]} x {shape[0]} picture"
+            f"{shape[1]} x {shape[0]} image"
         )
     if radius * pitch >= ball:
         raise UserError(
@@ -191,7 +191,7 @@ def _check_visible(
         )
 
 
-def without_drift(image: Picture, background: Picture, circle: Circle) -> Picture:
+def without_drift(image: Image, background: Image, circle: Circle) -> Image:
     """Return a press as it would look in the background's light.
 
     Each channel loses gain and offset of a robust line through the pixels far from the contact's

@@ -1,4 +1,4 @@
-"""Report of a calibration: held-out errors, warnings, record and pictures."""
+"""Report of a calibration: held-out errors, warnings, record and images."""
 
 import math
 from collections.abc import Sequence
@@ -10,44 +10,44 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from touchgoal.control.arrays import AnyPicture, Circle, Counts, Picture
+from touchgoal.control.arrays import AnyImage, Circle, Counts, Image
 from touchgoal.control.calibration import press_fit
 from touchgoal.control.calibration.ball import DepthErrors, squared_distance
 from touchgoal.control.calibration.calibrate import FittedCalibration
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import write_picture
+from touchgoal.runtime.image_file import write_image
 
 _USELESS = 0.9  # L1 errors above this share of the background's: the fit explains nothing
 _AT_LIMIT = 0.2  # share of circles at a search limit that is worth a warning
-_MAX_SHOWN = 6  # held-out presses in the picture
+_MAX_SHOWN = 6  # held-out presses in the image
 _CONTRAST = 4  # factor on the difference in its column
 _PAIRS_PER_ROW = 2
 _LIGHTS = {"R": (213, 94, 0), "G": (0, 158, 115), "B": (0, 114, 178)}  # Okabe and Ito
 _GREY, _INK, _PAPER = (150, 150, 150), (40, 40, 40), 255
 
 
-PictureErrors = dict[str, float]
-"""Mean absolute error of the whole picture (`l1`, counts); and within REGION contact radii, where the
+ImageErrors = dict[str, float]
+"""Mean absolute error of the whole image (`l1`, counts); and within REGION contact radii, where the
 press is: `l1_near`, peak signal-to-noise ratio (`psnr_near`, dB), similarity (`ssim_near`, 1 at best)."""
 
 
-def picture_errors(measured: Picture, simulated: Counts, circle: Circle) -> PictureErrors:
-    """Return the errors of a picture of a press, simulated without noise and not yet clipped."""
+def image_errors(measured: Image, simulated: Counts, circle: Circle) -> ImageErrors:
+    """Return the errors of an image of a press, simulated without noise and not yet clipped."""
     near = squared_distance(measured.shape, circle) < (press_fit.REGION * circle[2]) ** 2
-    truth, picture = measured.astype(np.float32), simulated.clip(0, 255)
-    error = np.abs(picture - truth)
+    truth, image = measured.astype(np.float32), simulated.clip(0, 255)
+    error = np.abs(image - truth)
     return {
         "l1_near": float(error[near].mean()),
         "psnr_near": float(10 * np.log10(255**2 / (error[near] ** 2).mean())),
-        "ssim_near": float(_structural_similarity(truth, picture)[near].mean()),
+        "ssim_near": float(_structural_similarity(truth, image)[near].mean()),
         "l1": float(error.mean()),
     }
 
 
-def mean_errors(errors: list[PictureErrors]) -> PictureErrors:
-    """Return the mean of each error over several pictures."""
+def mean_errors(errors: list[ImageErrors]) -> ImageErrors:
+    """Return the mean of each error over several images."""
     return {name: float(np.mean([each[name] for each in errors])) for name in errors[0]}
 
 
@@ -63,8 +63,8 @@ def _structural_similarity(a: Counts, b: Counts) -> Counts:
     return (2 * ma * mb + c1) * (2 * cov + c2) / ((ma * ma + mb * mb + c1) * (va + vb + c2))
 
 
-def held_out_errors(judged: FittedCalibration, test: PressSet) -> dict[str, PictureErrors]:
-    """Return mean errors of the held-out pictures by the predictor."""
+def held_out_errors(judged: FittedCalibration, test: PressSet) -> dict[str, ImageErrors]:
+    """Return mean errors of the held-out images by the predictor."""
     given = "labelled" if test.labelled else "found"
     background = judged.calibration.background.astype(np.float32)
     simulated = {
@@ -73,12 +73,12 @@ def held_out_errors(judged: FittedCalibration, test: PressSet) -> dict[str, Pict
         "fit, circles moved to the picture": judged.simulate(test, judged.fit_circles(test)),
     }
     return {
-        name: mean_errors([*map(picture_errors, test.images, pictures, test.circles)])
-        for name, pictures in simulated.items()
+        name: mean_errors([*map(image_errors, test.images, images, test.circles)])
+        for name, images in simulated.items()
     }
 
 
-def errors_table(errors: dict[str, PictureErrors], n: int) -> str:
+def errors_table(errors: dict[str, ImageErrors], n: int) -> str:
     """Format the held-out errors."""
     lines = [f"{f'{n} held-out presses, around the contact':<42}{'L1':>8}{'PSNR':>10}{'SSIM':>8}"]
     for name, e in errors.items():
@@ -115,8 +115,8 @@ def depth_table(depths: dict[str, dict[str, float]]) -> str:
     )
 
 
-def require_better_than_background(errors: dict[str, PictureErrors]) -> None:
-    """Raise UserError unless the fit beats the background on held-out pictures."""
+def require_better_than_background(errors: dict[str, ImageErrors]) -> None:
+    """Raise UserError unless the fit beats the background on held-out images."""
     alone = errors["background alone"]["l1_near"]
     best = min(e["l1_near"] for name, e in errors.items() if name != "background alone")
     if best > _USELESS * alone:
@@ -160,7 +160,7 @@ def warnings(fitted: FittedCalibration, presses: PressSet) -> list[str]:
 def calibration_metrics(
     fitted: FittedCalibration,
     presses: PressSet,
-    errors: dict[str, PictureErrors],
+    errors: dict[str, ImageErrors],
     depths: dict[str, dict[str, float]],
     n_test: int,
 ) -> dict[str, Any]:
@@ -182,18 +182,18 @@ def draw_held_out(judged: FittedCalibration, test: PressSet, path: Path) -> None
     """Write held-out presses beside their simulation."""
     shown = test.take(np.arange(min(_MAX_SHOWN, len(test))))
     simulated = judged.simulate(shown, judged.fit_circles(shown))
-    write_picture(path, side_by_side(list(shown.images), simulated))
+    write_image(path, side_by_side(list(shown.images), simulated))
 
 
 def side_by_side(
-    measured: Sequence[AnyPicture], simulated: Sequence[Counts]
+    measured: Sequence[AnyImage], simulated: Sequence[Counts]
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Draw measured | simulated | difference times 4 about grey, RGB, under a heading."""
     tiles = []
     for real, made in zip(measured, simulated, strict=True):
-        picture = made.clip(0, 255)
-        difference = (128 + _CONTRAST * (real - picture)).clip(0, 255)
-        tiles.append(np.hstack([real, picture, difference]).astype(np.uint8))
+        image = made.clip(0, 255)
+        difference = (128 + _CONTRAST * (real - image)).clip(0, 255)
+        tiles.append(np.hstack([real, image, difference]).astype(np.uint8))
     tiles += [np.full_like(tiles[0], _PAPER)] * (-len(tiles) % _PAIRS_PER_ROW)
     rows = [np.hstack(tiles[i : i + _PAIRS_PER_ROW]) for i in range(0, len(tiles), _PAIRS_PER_ROW)]
     width = tiles[0].shape[1] // 3
@@ -211,11 +211,11 @@ def light_compass(calibration: SensorCalibration) -> UInt8[np.ndarray, "320 320 
     A line's length is the channel's response to slope in the middle of the image, relative to the
     strongest.
     """
-    picture = np.full((320, 320, 3), _PAPER, np.uint8)
+    image = np.full((320, 320, 3), _PAPER, np.uint8)
     centre, reach = 160, 115.2  # px
-    cv2.circle(picture, (centre, centre), round(reach), _GREY, 1, cv2.LINE_AA)
+    cv2.circle(image, (centre, centre), round(reach), _GREY, 1, cv2.LINE_AA)
     for text, dx, dy in (("0", 1, 0), ("90", 0, 1), ("180", -1, 0), ("-90", 0, -1)):
-        _write(picture, text, centre + dx * 1.18 * reach, centre + dy * 1.18 * reach, _GREY)
+        _write(image, text, centre + dx * 1.18 * reach, centre + dy * 1.18 * reach, _GREY)
     strength = np.linalg.norm(calibration.response[:, :2, 0], axis=1)
     lengths = (reach * strength / strength.max()).tolist()
     for (name, colour), azimuth, length in zip(
@@ -223,14 +223,14 @@ def light_compass(calibration: SensorCalibration) -> UInt8[np.ndarray, "320 320 
     ):
         dx, dy = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
         tip = round(centre + length * dx), round(centre + length * dy)
-        cv2.arrowedLine(picture, (centre, centre), tip, colour, 3, cv2.LINE_AA, tipLength=0.08)
+        cv2.arrowedLine(image, (centre, centre), tip, colour, 3, cv2.LINE_AA, tipLength=0.08)
         beside = centre + 0.62 * length * dx - 28 * dy, centre + 0.62 * length * dy + 28 * dx
-        _write(picture, f"{name} {azimuth:.0f}", *beside, colour)
-    return picture
+        _write(image, f"{name} {azimuth:.0f}", *beside, colour)
+    return image
 
 
-def _write(picture: Picture, text: str, x: float, y: float, colour: tuple[int, int, int]) -> None:
+def _write(image: Image, text: str, x: float, y: float, colour: tuple[int, int, int]) -> None:
     """Write text centred at (x, y)."""
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
     at = round(x - width / 2), round(y + height / 2)
-    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)

@@ -7,11 +7,11 @@ from itertools import chain, islice
 
 import numpy as np
 
-from touchgoal.control.arrays import Circle, Counts, Map, Picture
+from touchgoal.control.arrays import Circle, Counts, Image, Map
 from touchgoal.control.calibration.ball import DepthErrors, find_circle, sphere_in
 from touchgoal.control.calibration.press_fit import move_circles
 from touchgoal.control.calibration.press_set import PressSet
-from touchgoal.control.tactile import picture_guard
+from touchgoal.control.tactile import image_guard
 from touchgoal.control.tactile.background import (
     SETTLES_WITHIN,
     Background,
@@ -36,10 +36,10 @@ _FIRM = 0.3
 class PressReading:
     """Depth, ball and force of one press."""
 
-    frame: Picture
+    frame: Image
     depth: Map  # of the gel, m
-    drawn: Picture  # the simulator's picture of that depth, RGB
-    unexplained: float  # share of the strongest tenth of the change that is not in that picture
+    drawn: Image  # the simulator's image of that depth, RGB
+    unexplained: float  # share of the strongest tenth of the change that is not in that image
     # circle, ball: contact circle (px), and sphere in the depth map there; None without a ball
     circle: Circle | None
     ball: DepthErrors | None
@@ -69,7 +69,7 @@ class SensorCheck:
     largest_shift_px: float  # of a marker from its rest position, px
     presses: list[PressReading]  # firm ones that the sensor file explains
     presses_unexplained: int  # number of firm ones that it does not explain
-    background: Picture  # the untouched sensor at the end
+    background: Image  # the untouched sensor at the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,21 +77,21 @@ class _Touch:
     """A frame in contact, and the background at that time; dots painted over."""
 
     strength: float
-    frame: Picture
-    plain: Picture
+    frame: Image
+    plain: Image
     background: Counts
 
 
 def check_sensor(
-    frames: Iterable[Picture],
+    frames: Iterable[Image],
     sensor: SensorModel,
     ball_radius: float | None = None,
-    on_frame: Callable[[Picture, float, bool], None] | None = None,
+    on_frame: Callable[[Image, float, bool], None] | None = None,
 ) -> SensorCheck:
     """Check the frames of one sensor in order, the first untouched; `ball_radius` (m) if known.
 
     `on_frame` takes each later frame that is not torn, its contact strength (counts), and whether it touches.
-    UserError if there are no frames, they are not this sensor's (`picture_guard`), or show no
+    UserError if there are no frames, they are not this sensor's (`image_guard`), or show no
     marker grid.
     """
     frames = iter(frames)
@@ -100,17 +100,17 @@ def check_sensor(
         raise UserError("no frames came: nothing to check")
     settled = first_steady(np.stack(start), "the sensor")
     first, frames = start[settled], chain(start[settled + 1 :], frames)
-    picture_guard.check_untouched(first, sensor, "the first frame")
-    picture_guard.check_unpressed(first, sensor, "the recording")
+    image_guard.check_untouched(first, sensor, "the first frame")
+    image_guard.check_unpressed(first, sensor, "the recording")
     calibration = load(sensor.sensor_file)
     detector = ContactDetector(Background(first[None]))
     dots = _Dots(first, sensor)
     touches: list[_Touch] = []
     untouched, steps, torn = [0.0], [], 0
-    before: Picture | None = first
+    before: Image | None = first
     background = first.astype(np.float32)
     for frame in frames:
-        if picture_guard.find_seam(frame):
+        if image_guard.find_seam(frame):
             torn += 1
             continue
         dots.follow(frame)
@@ -133,11 +133,9 @@ def check_sensor(
     untouched_now = np.rint(followed.image).astype(np.uint8)
     plain = dots.painted(untouched_now, at_rest=True)
     aligned = [_on_background(touch, plain) for touch in firm]
-    picture_guard.check_presses(plain, aligned, sensor, "the frames in contact")
+    image_guard.check_presses(plain, aligned, sensor, "the frames in contact")
     readings = _read(firm, sensor, calibration, ball_radius)
-    explained = [
-        reading for reading in readings if reading.unexplained <= picture_guard.UNEXPLAINED
-    ]
+    explained = [reading for reading in readings if reading.unexplained <= image_guard.UNEXPLAINED]
     return SensorCheck(
         frames=len(untouched) + len(touches) + torn,
         touching=len(touches),
@@ -160,7 +158,7 @@ def check_sensor(
 class _Dots:
     """Printed dots, followed and painted over; does nothing for a plain gel."""
 
-    def __init__(self, first: Picture, sensor: SensorModel) -> None:
+    def __init__(self, first: Image, sensor: SensorModel) -> None:
         grid, self._tracker, self._radius = sensor.markers, None, 0.0
         self._found: list[float] = [1.0]
         self.largest_shift = 0.0
@@ -172,7 +170,7 @@ class _Dots:
     def share_found(self) -> float | None:
         return None if self._tracker is None else float(np.mean(self._found))
 
-    def follow(self, frame: Picture) -> None:
+    def follow(self, frame: Image) -> None:
         if self._tracker is not None:
             self._found.append(float(self._tracker.update(frame).found.mean()))
             shift = np.linalg.norm(self._tracker.displacement, axis=-1).max()
@@ -194,7 +192,7 @@ def _read(
     estimator, pitch = DepthEstimator(calibration), sensor.pixel_pitch
     readings = []
     for touch in touches:
-        read = picture_guard.explain(estimator, calibration, touch.plain, touch.background)
+        read = image_guard.explain(estimator, calibration, touch.plain, touch.background)
         circle = ball = None
         if ball_radius is not None:
             with suppress(UserError):  # the ball is too faint
@@ -217,7 +215,7 @@ def _contact_circle(touch: _Touch, calibration: SensorCalibration, ball_radius: 
     return move_circles(calibration, press, found)[0]
 
 
-def _on_background(touch: _Touch, background: Picture) -> Picture:
+def _on_background(touch: _Touch, background: Image) -> Image:
     """Return the touch's frame with its background exchanged for another one."""
     change = touch.plain - touch.background  # float
     return np.rint(background + change).clip(0, 255).astype(np.uint8)
@@ -233,7 +231,7 @@ def _firmest(touches: list[_Touch]) -> list[_Touch]:
     return [touch for touch in best if touch.strength >= least]
 
 
-def _noise(before: Picture, frame: Picture) -> float:
+def _noise(before: Image, frame: Image) -> float:
     """Return the noise of a pixel, counts; the median change counts as drift."""
     change = frame.astype(np.float32) - before
     return float((change - np.median(change, (0, 1))).std() / np.sqrt(2))

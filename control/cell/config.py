@@ -98,15 +98,15 @@ class FingertipsSection:
     right: str
     """USB serial number, or address of a stream."""
     rate: Rate | None = None
-    """Pictures a second, Hz; default: the model's."""
+    """Images a second, Hz; default: the model's."""
     sensor_files: tuple[str, str] | None = None
     """Folders that calibrate wrote for the left and the right sensor; default: the model's for both."""
     size: Size | None = None
     """Width and height to ask the sensors' cameras for, pixels; default: their default."""
     border: Annotated[float, Field(ge=0, lt=0.5)] | None = None
-    """Share cut off at each side of a camera's picture; default: the model's."""
+    """Share cut off at each side of a camera's image; default: the model's."""
     corners: tuple[Corners, Corners] | None = None
-    """Corners of the left and the right gel in the camera's picture, px (top left, top right, bottom left,
+    """Corners of the left and the right gel in the camera's image, px (top left, top right, bottom left,
     bottom right), for a camera at an angle (gelsight_wedge), in place of a border."""
     exposure: Exposure | None = None
     """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); default: as it is set."""
@@ -121,7 +121,7 @@ class CameraSection:
     source: str
     """Device (/dev/video2), index, or address of a stream."""
     rate: Rate = 30.0
-    """Pictures a second, Hz."""
+    """Images a second, Hz."""
     size: Size | None = None
     """Width and height to ask the camera for, pixels; default: its default."""
     exposure: Exposure | None = None
@@ -217,7 +217,7 @@ class SafetySection:
     """Indentation of a gel at which the arm stops and the hand opens, m; default: the task's own, at
     most what the sensor file can read."""
     observation_age: Seconds = 0.1
-    """Age of a picture at which the arm holds, s; five times that stops it. If you raise it, a learned
+    """Age of an image at which the arm holds, s; five times that stops it. If you raise it, a learned
     policy goes slower with observations older than 0.1 s."""
     state_age: Seconds = 0.05
     """Age of the arm's state at which the arm holds, s; five times that stops it."""

@@ -29,9 +29,9 @@ from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime.errors import CheckResult, UserError, require_all_ok
 
-# Hz, and s of wall time without a picture: slow enough for any loaded machine.
+# Hz, and s of wall time without an image: slow enough for any loaded machine.
 _LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 0.1, 10.0
-_TWIN_RATE = 25.0  # Hz of a twin's pictures in its own time, at least
+_TWIN_RATE = 25.0  # Hz of a twin's images in its own time, at least
 _CLOCK_TIMEOUT = 1.0  # s of wall time for which an arm's clock may stand still
 _POLL_INTERVAL = 0.002  # s between readings of it
 _HISTORY_LENGTH = 2000  # readings
@@ -232,7 +232,7 @@ def _tactile_camera(whole: CellConfig, cell: FingertipsSection, side: int) -> Ta
 
 
 def _timed(config: VideoConfig, cell: CellConfig) -> VideoConfig:
-    """Return the video's settings without deadlines for a lock-step twin, whose pictures come late."""
+    """Return the video's settings without deadlines for a lock-step twin, whose images come late."""
     if not cell.lock_step:
         return config
     return replace(
@@ -240,5 +240,5 @@ def _timed(config: VideoConfig, cell: CellConfig) -> VideoConfig:
         rate=_LOCK_STEP_RATE,
         timeout=_LOCK_STEP_TIMEOUT,
         frozen_after=0.0,
-        frozen_pictures=round(config.frozen_after * _TWIN_RATE),
+        frozen_images=round(config.frozen_after * _TWIN_RATE),
     )

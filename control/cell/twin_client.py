@@ -19,8 +19,8 @@ _TIMEOUT = 60.0  # s for an answer, on a loaded machine, too
 _REST_TIMEOUT, _POLL_INTERVAL = 10.0, 0.1  # s for the arm of the run before to come to rest
 _DT = 1e-3  # s of a step of the twin
 _STREAM_STEPS = 5  # steps between two commands of the arm's stream, `arms.franka.RATE`
-_PICTURE_TIMEOUT = 2.0  # s for a picture that was sent
-_SETTLING = 0.3  # s without a picture after which none is on its way
+_IMAGE_TIMEOUT = 2.0  # s for an image that was sent
+_SETTLING = 0.3  # s without an image after which none is on its way
 _HISTORY_LENGTH = 400  # times kept for the ages of readings
 
 
@@ -78,7 +78,7 @@ class LockStepClock:
     """Clock of a twin in lock-step: its time advances only while a deployment waits for it.
 
     So nothing depends on the machine's speed: the same seed and cell file give the same run. Arm and
-    hand take part in every step, and time goes on only once every command, answer and picture under
+    hand take part in every step, and time goes on only once every command, answer and image under
     way has arrived. libfranka's own 1 kHz loop takes part in every millisecond. Once a twin has ended,
     time goes on in real time, so that ages show it.
     """
@@ -100,7 +100,7 @@ class LockStepClock:
         self._issued = self._answered = 0
         answer = self._ask("hold")
         self._time = self._gripper_due = answer["time"]
-        self._missed = self._missed_pictures(self._ask("pictures"))
+        self._missed = self._missed_images(self._ask("pictures"))
         self._history = deque([(time.monotonic(), self._time)], maxlen=_HISTORY_LENGTH)
 
     def reset(self, seed: int) -> None:
@@ -138,7 +138,7 @@ class LockStepClock:
                 self._let_drivers_tick()
         if self._lost:
             self._wait_without_twin(until)
-        self._await_pictures({} if self._lost else self._ask("pictures"))
+        self._await_images({} if self._lost else self._ask("pictures"))
         self._await_load(last_load)
 
     def close(self) -> None:
@@ -160,8 +160,8 @@ class LockStepClock:
             self._history.append((time.monotonic(), self._time))
             self._arm.advance(self._time)
 
-    def _missed_pictures(self, sent: dict[str, int]) -> dict[str, int]:
-        """Return the number of sent pictures that each camera has missed; DriverError for a broken one."""
+    def _missed_images(self, sent: dict[str, int]) -> dict[str, int]:
+        """Return the number of sent images that each camera has missed; DriverError for a broken one."""
         found: dict[str, int] | None = None
         while True:
             before, streams = found, self._streams(sent)
@@ -175,13 +175,13 @@ class LockStepClock:
         named = ((key, key.rpartition(".")[2], camera) for key, camera in self._cameras.items())
         return [(key, name, camera) for key, name, camera in named if name in sent]
 
-    def _await_pictures(self, sent: dict[str, int]) -> None:
-        """Wait for all pictures that the twin has sent, except lost ones."""
-        end = time.monotonic() + _PICTURE_TIMEOUT
+    def _await_images(self, sent: dict[str, int]) -> None:
+        """Wait for all images that the twin has sent, except lost ones."""
+        end = time.monotonic() + _IMAGE_TIMEOUT
         for key, name, camera in self._streams(sent):
             with suppress(DriverError):
                 while (missing := sent[name] - self._missed[key] - camera.read().sequence) > 0:
-                    # the picture is lost, as when a stream is opened again
+                    # the image is lost, as when a stream is opened again
                     if time.monotonic() > end:
                         self._missed[key] += missing
                         break
@@ -189,7 +189,7 @@ class LockStepClock:
 
     def _await_load(self, sent: float) -> None:
         """Wait for the load cell's line of that time; a cell that loses lines is not waited for again."""
-        end = time.monotonic() + _PICTURE_TIMEOUT
+        end = time.monotonic() + _IMAGE_TIMEOUT
         while self._load_cell is not None and self._load_cell.clock < sent:
             if time.monotonic() > end:
                 self._load_cell = None

@@ -12,7 +12,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from touchgoal.control import features as ft
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.cell.config import CameraSection, Exposure, Kelvin, Pixels
 from touchgoal.control.deployment.observation import crop_and_resize
 from touchgoal.control.interfaces import Camera, LoadCell, TactileSensor
@@ -38,9 +38,9 @@ class GelSection:
     size: tuple[Pixels, Pixels] | None = None
     """Width and height to ask the sensor's camera for, pixels; default: its default."""
     border: Annotated[float, Field(ge=0, lt=0.5)] | None = None
-    """Share cut off at each side of the camera's picture; default: the model's."""
+    """Share cut off at each side of the camera's image; default: the model's."""
     corners: Corners | None = None
-    """Corners of the gel in the camera's picture, px, for a camera at an angle (gelsight_wedge)."""
+    """Corners of the gel in the camera's image, px, for a camera at an angle (gelsight_wedge)."""
     exposure: Exposure | None = None
     """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); default: as it is set."""
     white_balance: Kelvin | None = None
@@ -75,9 +75,9 @@ class WandConfig:
 
 @plain_dataclass(frozen=True, eq=False)
 class WandReading:
-    """One reading of all devices: RGB picture of the gel, view -> RGB, force of the load cell (N)."""
+    """One reading of all devices: RGB image of the gel, view -> RGB, force of the load cell (N)."""
 
-    picture: Picture
+    image: Image
     views: dict[str, UInt8[np.ndarray, "H W 3"]]
     force: float
 
@@ -92,7 +92,7 @@ class Wand:
     _last: int = field(default=-1, init=False)
 
     def read(self) -> WandReading | None:
-        """Return the readings, or None until the gel's next picture; DriverError as the devices."""
+        """Return the readings, or None until the gel's next image; DriverError as the devices."""
         frame = self.gel.read()
         if frame.sequence == self._last:
             return None

@@ -9,7 +9,7 @@ from collections import deque
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.cell.wand import WandReading
 from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.contact import ContactDetector, threshold_for
@@ -43,9 +43,9 @@ class WandRecorder:
     """
 
     def __init__(
-        self, sensor: SensorModel, first: Picture | None = None, counts: tuple[int, ...] = (0, 0, 0)
+        self, sensor: SensorModel, first: Image | None = None, counts: tuple[int, ...] = (0, 0, 0)
     ) -> None:
-        """`first`: first untouched picture of this gel, None if new; `counts`: touches per range."""
+        """`first`: first untouched image of this gel, None if new; `counts`: touches per range."""
         self.hint, self.force = "leave the gel untouched", 0.0
         self.counts = list(counts)
         self.gel_wear: GelWear | None = None
@@ -53,7 +53,7 @@ class WandRecorder:
         self._free: deque[WandReading] = deque(maxlen=_BEFORE)  # untouched, since the last touch
         self._detector: ContactDetector | None = None  # None until the gel has settled
         self._air = 0.0  # the load cell's force in free air, N
-        self._press: list[tuple[Picture, float]] = []
+        self._press: list[tuple[Image, float]] = []
         self._disagreed = 0  # readings in a row at which gel and load cell disagree
         self._before: WandReading | None = None
         self._peak: WandReading | None = None
@@ -67,12 +67,12 @@ class WandRecorder:
         self.force = reading.force - self._air
         if self._detector is None:
             return self._settle(reading)
-        touching = self._detector.update(reading.picture)
+        touching = self._detector.update(reading.image)
         if self._press:
             return self._follow(reading, touching)
         elif touching and self.force > _CONTACT:
             self._before, self._peak = self._free[0], reading
-            self._press = [(reading.picture, self.force)]
+            self._press = [(reading.image, self.force)]
         elif touching or self.force > _CONTACT:
             self._disagree(touching)
         else:
@@ -110,17 +110,17 @@ class WandRecorder:
         recent = list(self._free)[-_SETTLING:]
         if len(recent) < _SETTLING:
             return None
-        pictures = np.stack([free.picture for free in recent])
-        parts = pictures[:_PART], pictures[-_PART:]
+        images = np.stack([free.image for free in recent])
+        parts = images[:_PART], images[-_PART:]
         start, end = (np.median(part, 0).astype(np.uint8) for part in parts)
         moved = float(local_change(end, start).max()) > _SETTLED
         if moved or np.ptp([free.force for free in recent]) > _CONTACT:
             self.hint = "leave the gel untouched and the wand still, until it has settled"
             return None
-        middle = np.median(pictures, 0).astype(np.uint8)
+        middle = np.median(images, 0).astype(np.uint8)
         self._first = middle if self._first is None else self._first
         self.gel_wear = find_wear(middle, self._first, self._sensor)
-        threshold = threshold_for(pictures, middle)
+        threshold = threshold_for(images, middle)
         self._detector = ContactDetector(Background(middle[None]), threshold)
         self._free = deque(recent, maxlen=_BEFORE)
         self._air = float(np.median([free.force for free in recent]))
@@ -140,7 +140,7 @@ class WandRecorder:
             return self._end_press()
         largest = max(force for _, force in self._press)
         if len(self._press) < _LONGEST:
-            self._press.append((reading.picture, self.force))
+            self._press.append((reading.image, self.force))
             if self.force > largest:
                 self._peak, largest = reading, self.force
         if largest > MAX_FORCE:
@@ -167,7 +167,7 @@ class WandRecorder:
             wrong = "not recorded, too quick: press slowly, and hold before you lift"
         else:
             chosen = evenly_loaded(forces[:rise], CLIP - 1)
-            clip = [self._before.picture, *(self._press[i][0] for i in chosen)]
+            clip = [self._before.image, *(self._press[i][0] for i in chosen)]
             load = np.concatenate([[0.0], forces[chosen]]).astype(np.float32)
             before, views = self._before.views, self._peak.views
             self._made = WandTouch(before, views, np.stack(clip), load)

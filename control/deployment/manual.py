@@ -26,7 +26,7 @@ _STILL_SECONDS = 1.0  # s for which a hand must stand still to have arrived
 _THERE = 1e-3  # rad; an arm this near a posture need not move to it
 
 
-def without_pictures(cell: CellConfig) -> CellConfig:
+def without_images(cell: CellConfig) -> CellConfig:
     """Return the cell without cameras and fingertips: a broken one must not keep the arm in place."""
     return replace(cell, cameras={}, fingertips=None)
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from touchgoal.control import features as ft
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.interfaces import (
     ArmReading,
@@ -34,8 +34,8 @@ class CellReading:
     arm: ArmReading
     gripper: GripperReading
     load: LoadReading | None  # of the load cell; None without one
-    age: float  # of the oldest picture, s
-    oldest_source: str  # source of that picture
+    age: float  # of the oldest image, s
+    oldest_source: str  # source of that image
     indentation: Float[np.ndarray, "2"]  # depth in left and right gel, m; 0 without fingertips
     fault: str  # a device's own report of a fault; empty if none
 
@@ -52,7 +52,7 @@ class ObservationReader:
             taken = camera.read().image.shape[:2]
             if key not in ft.TACTILE and min(np.subtract(taken, camera_size)) < 0:
                 raise UserError(
-                    f"{key} takes pictures of {taken[0]} x {taken[1]}, {camera_size[0]} x "
+                    f"{key} takes images of {taken[0]} x {taken[1]}, {camera_size[0]} x "
                     f"{camera_size[1]} are needed: make them larger where the camera is set"
                 )
         robot = connection.robot
@@ -159,7 +159,7 @@ def quaternion(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
     return q * np.sign(q[np.argmax(np.abs(q))])
 
 
-def crop_and_resize(image: Picture, shape: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+def crop_and_resize(image: Image, shape: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
     """Return the middle of an image, in the proportions and at the size (rows, columns) of `shape`."""
     rows, columns = shape
     height, width = image.shape[:2]

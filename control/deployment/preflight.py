@@ -11,7 +11,7 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY, UR_RTDE, ClientLibrary
 from touchgoal.control.arms.driver_process import error_line
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.hand import require_empty_hand
@@ -21,9 +21,9 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.control.sensors.exchanged import fingertips_exchanged
 from touchgoal.control.tactile.contact import contact_strength
+from touchgoal.control.tactile.image_guard import check_untouched
 from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.markers.tracker import find_markers, without_markers
-from touchgoal.control.tactile.picture_guard import check_untouched
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime.errors import CheckResult, UserError
@@ -93,7 +93,7 @@ def measure_rates(connection: CellConnection) -> dict[str, float]:
 
 
 def _sequences(connection: CellConnection) -> dict[str, int]:
-    """Return the number of pictures each camera has taken; 0 for a broken one."""
+    """Return the number of images each camera has taken; 0 for a broken one."""
     counts = dict.fromkeys(connection.cameras, 0)
     for key, camera in connection.cameras.items():
         with suppress(Exception):  # of any driver; the camera's own check says so
@@ -156,7 +156,7 @@ def _limits(cell: CellConfig, safety: ActionFilter) -> str:
         require_readable(find_sensor(cell.sensor), safety.limits.indentation)
     watchdogs = safety.watchdogs
     return (
-        f"joints up to {safety.joints.velocity.max():.2f} rad/s; holds when pictures are older than "
+        f"joints up to {safety.joints.velocity.max():.2f} rad/s; holds when images are older than "
         f"{1e3 * watchdogs.observation.hold:.0f} ms or the arm's state than "
         f"{1e3 * watchdogs.state.hold:.0f}"
     )
@@ -208,13 +208,13 @@ def _camera(camera: Camera, rate: float, nominal: float) -> str:
         untouched = f", untouched ({strength:.1f} counts from its sensor file)"
     if rate < _MIN_RATE_SHARE * nominal:
         raise UserError(
-            f"{rate:.1f} pictures a second instead of {nominal:g}: check its cable, the light and what "
+            f"{rate:.1f} images a second instead of {nominal:g}: check its cable, the light and what "
             "else this computer does"
         )
-    return f"{rate:.1f} pictures a second{untouched}"
+    return f"{rate:.1f} images a second{untouched}"
 
 
-def _fingertip(camera: TactileSensor) -> tuple[Picture, Picture]:
+def _fingertip(camera: TactileSensor) -> tuple[Image, Image]:
     """Return a fingertip's image and its sensor file's background, both without dots."""
     frame, model = camera.read().image, camera.model
     if model.markers is not None:  # the dots' places differ from unit to unit

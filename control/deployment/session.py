@@ -24,7 +24,7 @@ from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor, Cost
 from touchgoal.control.run_log import SLOW_ARM, RunLog, slow_arm
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.control.sensors.exchanged import Picture, cameras_exchanged
+from touchgoal.control.sensors.exchanged import Image, cameras_exchanged
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.tactile.light_gain import light_advice
 from touchgoal.runtime.errors import UserError
@@ -161,7 +161,7 @@ class Session:
             )
         return None
 
-    def _camera_images(self) -> dict[str, Picture]:
+    def _camera_images(self) -> dict[str, Image]:
         """Return the newest image of front and wrist camera, in this order, of those that work."""
         images = {}
         for key, camera in self.connection.cameras.items():

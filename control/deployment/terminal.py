@@ -87,7 +87,7 @@ class Terminal:
         line = (
             f"{status.seconds:6.1f} s  {mode:<24}  {force:5.1f} N  "
             f"gel {1e3 * reading.indentation.max():3.1f} mm  gripper {1e3 * status.width:3.0f} mm  "
-            f"pictures {1e3 * reading.age:4.0f} ms  late {1e3 * status.late:4.1f} ms  {cost}"
+            f"images {1e3 * reading.age:4.0f} ms  late {1e3 * status.late:4.1f} ms  {cost}"
         )
         print(f"\r{line[:118]:<118}", end="", flush=True)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image
+from PIL import Image as PILImage
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.runtime.atomic_write import atomic_write
 
 _DICTIONARY = cv2.aruco.DICT_4X4_50
@@ -40,7 +40,7 @@ class Board:
         """Width and height, m."""
         return self.columns * self.square, self.rows * self.square
 
-    def find(self, image: Picture) -> BoardView | None:
+    def find(self, image: Image) -> BoardView | None:
         """Return the corners in an RGB image, by the pattern that has more; None if it shows too few."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         found = [view for old in (False, True) if (view := self._find(grey, old))]
@@ -77,7 +77,7 @@ class Board:
         place = (margin, page.shape[0] - margin)
         cv2.putText(page, text, place, cv2.FONT_HERSHEY_SIMPLEX, 1.6, 0, 3, cv2.LINE_AA)
         with atomic_write(path) as unfinished:
-            Image.fromarray(page).save(unfinished, format="PNG", dpi=(_DPI, _DPI))
+            PILImage.fromarray(page).save(unfinished, format="PNG", dpi=(_DPI, _DPI))
 
     def _board(self, old_pattern: bool) -> "cv2.aruco.CharucoBoard":
         dictionary = cv2.aruco.getPredefinedDictionary(_DICTIONARY)

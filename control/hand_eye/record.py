@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.hand_eye.board import Board, BoardView
 from touchgoal.control.hand_eye.solve import HandEye, Transform, calibrate_hand_eye
@@ -13,15 +13,15 @@ from touchgoal.control.motion.arm_models import ArmModel
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.runtime.errors import UserError
 
-_SETTLING = 0.5  # s after which an arm swings no more and pictures are newer than its motion
+_SETTLING = 0.5  # s after which an arm swings no more and images are newer than its motion
 _REST = 0.01  # rad/s
 
 
 @dataclass(frozen=True)
 class View:
-    """A picture, the arm's measured joint positions (rad) in it, and the board if it is seen."""
+    """An image, the arm's measured joint positions (rad) in it, and the board if it is seen."""
 
-    image: Picture
+    image: Image
     q: Joints
     board: BoardView | None
 

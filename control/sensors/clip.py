@@ -20,9 +20,9 @@ from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture
+from touchgoal.runtime.image_file import read_image
 
-PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
+IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 VIDEOS = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".gif"}
 """Endings of image and of video files that a folder is searched for."""
 _UNTOUCHED = "background.png"  # untouched sensor of a folder of presses
@@ -124,7 +124,7 @@ def read_frames(path: Path) -> tuple[UInt8[np.ndarray, "n h w 3"], float | None]
 
 def image_files(folder: Path) -> list[Path]:
     """Return the images of a folder, background.png before the others; UserError: there is none."""
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in PICTURES]
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES]
     if not paths and (folder / "data").is_dir():
         raise UserError(
             f"{folder} holds data/ but no meta/info.json; if it is a set of episodes, run: "
@@ -133,7 +133,7 @@ def image_files(folder: Path) -> list[Path]:
     for path in () if paths else sorted(folder.iterdir()):
         refuse_other_format(path)
     if not paths:
-        raise UserError(f"{folder} holds no image ({', '.join(sorted(PICTURES))})")
+        raise UserError(f"{folder} holds no image ({', '.join(sorted(IMAGES))})")
     return sorted(in_natural_order(paths), key=lambda path: path.name != _UNTOUCHED)
 
 
@@ -156,7 +156,7 @@ def refuse_other_format(path: Path) -> None:
         if path.suffix.lower() in suffixes or begin.startswith(signature):
             raise UserError(
                 f"{path} is {name}, which is not read here: convert it to a LeRobotDataset v3 "
-                "(docs/data_format.md), or its pictures to videos or folders of PNG files"
+                "(docs/data_format.md), or its images to videos or folders of PNG files"
             )
 
 
@@ -206,7 +206,7 @@ def _upright(
 
 def _folder_frames(folder: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     for path in image_files(folder):
-        picture = read_picture(path)
-        if picture is None:
+        image = read_image(path)
+        if image is None:
             raise UserError(f"{path} is no readable image: remove or replace it")
-        yield picture
+        yield image

@@ -1,20 +1,18 @@
-"""Exchanged cameras and fingertips, found by their pictures."""
+"""Exchanged cameras and fingertips, found by their images."""
 
 import cv2
 import numpy as np
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.tactile.background import local_change
 
 _CLEARLY = 1.5  # factor by which a fingertip must be more like the other's sensor file
-_SMALL = 32  # px of a side at which pictures of cameras are compared
-_MOVED = 2.5  # counts: median change of a picture whose camera has moved, at least
-_TIMES = 3.0  # factor by which the other camera's picture must change less
+_SMALL = 32  # px of a side at which images of cameras are compared
+_MOVED = 2.5  # counts: median change of an image whose camera has moved, at least
+_TIMES = 3.0  # factor by which the other camera's image must change less
 
 
-def fingertips_exchanged(
-    frames: tuple[Picture, Picture], backgrounds: tuple[Picture, Picture]
-) -> bool:
+def fingertips_exchanged(frames: tuple[Image, Image], backgrounds: tuple[Image, Image]) -> bool:
     """Return whether two untouched fingertips each look more like the other's sensor file.
 
     Both must, because light drifts and a file may be old. Frames and backgrounds are left, then
@@ -27,16 +25,16 @@ def fingertips_exchanged(
     return all(_CLEARLY * unlike[side][1 - side] < unlike[side][side] for side in (0, 1))
 
 
-def cameras_exchanged(front: tuple[Picture, Picture], wrist: tuple[Picture, Picture]) -> bool:
+def cameras_exchanged(front: tuple[Image, Image], wrist: tuple[Image, Image]) -> bool:
     """Return whether the front camera has moved with the arm and the wrist camera has not.
 
-    False for a view without structure; the pictures are from before and after a move of the arm.
+    False for a view without structure; the images are from before and after a move of the arm.
     """
     moved = _median_change(*front)
     return moved > _MOVED and moved > _TIMES * _median_change(*wrist)
 
 
-def _median_change(before: Picture, after: Picture) -> float:
+def _median_change(before: Image, after: Image) -> float:
     """Return the median change of the pixels after a common gain (exposure), counts."""
     size = _SMALL, _SMALL
     small = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (before, after)]

@@ -6,7 +6,7 @@ from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.sensors.clip import open_clip
 from touchgoal.control.sensors.tactile_camera import (
@@ -25,7 +25,7 @@ _TIMEOUT = 5.0  # s without a new frame after which the sensor counts as lost
 
 
 def is_recorded(source: str) -> bool:
-    """Return whether a source is a video file or a folder of pictures."""
+    """Return whether a source is a video file or a folder of images."""
     return not source.startswith("/dev/") and Path(source).exists()
 
 
@@ -36,10 +36,10 @@ def open_frames(
     exposure: float | None = None,
     white_balance: int | None = None,
     seconds: float = math.inf,
-) -> Generator[Picture, None, None]:
+) -> Generator[Image, None, None]:
     """Yield the frames of a recording, or of a live sensor for some seconds or until Ctrl-C.
 
-    The source is one of `fingertip_video`, or a video file or a folder of pictures; exposure and
+    The source is one of `fingertip_video`, or a video file or a folder of images; exposure and
     white balance are locked on a live camera (`VideoConfig`). UserError or DriverError if the
     source cannot be read, or a live sensor sent nothing for 5 s.
     """
@@ -59,7 +59,7 @@ def open_frames(
                 last, heard = frame.sequence, time.monotonic()
                 yield frame.image
             elif time.monotonic() > heard + _TIMEOUT:
-                raise DriverError(f"{source}: {camera.problem or 'no more pictures'}")
+                raise DriverError(f"{source}: {camera.problem or 'no more images'}")
             time.sleep(_POLL_INTERVAL)
     except KeyboardInterrupt:
         print("ended")
@@ -78,10 +78,10 @@ def fingertip_video(source: str, model: SensorModel) -> VideoConfig:
 
 def recorded_frames(
     source: Path, model: SensorModel, corners: Corners | None = None
-) -> Generator[Picture, None, None]:
-    """Yield the frames of a video, or of a folder's pictures by name (background.png first).
+) -> Generator[Image, None, None]:
+    """Yield the frames of a video, or of a folder's images by name (background.png first).
 
-    Without corners of the gel the pictures count as already cut. UserError if there are none, or
+    Without corners of the gel the images count as already cut. UserError if there are none, or
     they have other proportions than the sensor's.
     """
     view = Crop(corners=corners)

@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 from touchgoal.control.interfaces import DriverError
 
 T = TypeVar("T")
-_CLOSE_TIMEOUT = 15.0  # s; the slowest poll, of a lock-step twin's pictures, takes 10
+_CLOSE_TIMEOUT = 15.0  # s; the slowest poll, of a lock-step twin's images, takes 10
 
 
 class LatestValue(Generic[T]):

@@ -1,4 +1,4 @@
-"""Fingertip sensors as cameras: pictures cut and scaled to the sensor model's image."""
+"""Fingertip sensors as cameras: images cut and scaled to the sensor model's image."""
 
 from dataclasses import dataclass, replace
 
@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.interfaces import Camera, DriverError, Frame
-from touchgoal.control.tactile.picture_guard import find_seam
+from touchgoal.control.tactile.image_guard import find_seam
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_WEDGE, SensorModel
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Corners
@@ -16,7 +16,7 @@ from touchgoal.runtime.option_types import Corners
 
 @dataclass(frozen=True)
 class Crop:
-    """Position of the gel in its camera's picture."""
+    """Position of the gel in its camera's image."""
 
     border: float = 0.0  # share cut off at each side; 0 for a stream that is already cut
     quarter_turns: int = 0  # counter-clockwise, before cutting; a DIGIT's camera lies on its side
@@ -34,7 +34,7 @@ NO_CROP = Crop()
 class TactileCamera:
     """The TactileSensor interface over a Camera; it closes the camera with it.
 
-    A torn or rolled picture is left out: the frame before it stays, with its stamp.
+    A torn or rolled image is left out: the frame before it stays, with its stamp.
     """
 
     def __init__(self, camera: Camera, model: SensorModel, crop: Crop) -> None:
@@ -54,7 +54,7 @@ class TactileCamera:
         return self._camera.problem or self._torn
 
     def read(self) -> Frame:
-        """See Camera; UserError if the picture's proportions are not the sensor's."""
+        """See Camera; UserError if the image's proportions are not the sensor's."""
         raw = self._camera.read()
         if self._raw is not raw:
             frame = replace(raw, image=crop_to_sensor(raw.image, self._model, self._crop))
@@ -63,7 +63,7 @@ class TactileCamera:
             if not self._torn:
                 self._whole = frame
         if self._whole is None:
-            raise DriverError(f"the picture of the {self._model.name}: {self._torn}")
+            raise DriverError(f"the image of the {self._model.name}: {self._torn}")
         return self._whole
 
     def close(self) -> None:
@@ -83,15 +83,15 @@ def fingertip_view(
     if model.name == GELSIGHT_WEDGE.name and "://" not in source:
         raise UserError(
             f"the camera of a {model.name} sees its gel at an angle: give the corners of the gel "
-            "in its picture"
+            "in its image"
         )
     view = DIGIT_CROP if model.name == DIGIT.name else GELSIGHT_MINI_CROP
     view = NO_CROP if "://" in source else view
     return view if border is None else replace(view, border=border)
 
 
-def crop_to_sensor(image: Picture, model: SensorModel, crop: Crop) -> UInt8[np.ndarray, "H W 3"]:
-    """Cut the sensor's picture out of its camera's and scale it to the model's shape.
+def crop_to_sensor(image: Image, model: SensorModel, crop: Crop) -> UInt8[np.ndarray, "H W 3"]:
+    """Cut the sensor's image out of its camera's and scale it to the model's shape.
 
     UserError if it has other proportions, or the corners are no quadrangle in it.
     """
@@ -105,7 +105,7 @@ def crop_to_sensor(image: Picture, model: SensorModel, crop: Crop) -> UInt8[np.n
     ratio = image.shape[1] / image.shape[0] / (columns / rows)
     if not 0.97 < ratio < 1.03:
         raise UserError(
-            f"the picture of the {model.name} is {image.shape[1]}x{image.shape[0]}, not "
+            f"the image of the {model.name} is {image.shape[1]}x{image.shape[0]}, not "
             f"{columns}:{rows}: correct `border` or `quarter_turns` of its crop"
         )
     if image.shape[:2] == (rows, columns):
@@ -113,10 +113,10 @@ def crop_to_sensor(image: Picture, model: SensorModel, crop: Crop) -> UInt8[np.n
     return cv2.resize(np.ascontiguousarray(image), (columns, rows), interpolation=cv2.INTER_AREA)
 
 
-def rectify(image: Picture, shape: tuple[int, int], corners: Corners) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the gel between its corners from above, in a picture of a shape (rows, columns).
+def rectify(image: Image, shape: tuple[int, int], corners: Corners) -> UInt8[np.ndarray, "H W 3"]:
+    """Return the gel between its corners from above, in an image of a shape (rows, columns).
 
-    UserError if the corners are no quadrangle in the picture.
+    UserError if the corners are no quadrangle in the image.
     """
     given = np.array(corners, np.float32)
     _check_corners(given, image.shape[:2])
@@ -124,19 +124,19 @@ def rectify(image: Picture, shape: tuple[int, int], corners: Corners) -> UInt8[n
     # First at the camera's resolution, then reduced, so that pixels are averaged, not skipped.
     finer = max(1, round(float(np.linalg.norm(given[1] - given[0])) / columns))
     high, wide = finer * rows, finer * columns
-    # The corners of a picture lie half a pixel out from the middles of its outermost pixels.
+    # The corners of an image lie half a pixel out from the middles of its outermost pixels.
     edges = np.array([(0, 0), (wide, 0), (0, high), (wide, high)], np.float32) - 0.5
     flat = cv2.warpPerspective(image, cv2.getPerspectiveTransform(given, edges), (wide, high))
     return cv2.resize(flat, (columns, rows), interpolation=cv2.INTER_AREA) if finer > 1 else flat
 
 
 def _check_corners(corners: Float32[np.ndarray, "4 2"], shape: tuple[int, int]) -> None:
-    """Raise UserError unless these are corners of a gel in a picture of a shape (rows, columns)."""
+    """Raise UserError unless these are corners of a gel in an image of a shape (rows, columns)."""
     height, width = shape
     if (corners < -0.5).any() or (corners > np.array([width, height]) - 0.5).any():
         raise UserError(
-            f"a corner of the gel lies outside its camera's picture, which is {width}x{height}: "
-            "give them in pixels of that picture, top left, top right, bottom left, bottom right"
+            f"a corner of the gel lies outside its camera's image, which is {width}x{height}: "
+            "give them in pixels of that image, top left, top right, bottom left, bottom right"
         )
     around = corners[[0, 1, 3, 2]]
     sides = np.roll(around, -1, 0) - around
@@ -144,5 +144,5 @@ def _check_corners(corners: Float32[np.ndarray, "4 2"], shape: tuple[int, int]) 
     if (sides[:, 0] * following[:, 1] <= sides[:, 1] * following[:, 0]).any():
         raise UserError(
             "the corners of the gel must be top left, top right, bottom left and bottom right in "
-            "the picture; these are in another order, or no quadrangle"
+            "the image; these are in another order, or no quadrangle"
         )

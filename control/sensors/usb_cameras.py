@@ -28,7 +28,7 @@ class UsbCamera:
 
 
 def list_cameras(root: Path = _ROOT) -> list[UsbCamera]:
-    """List all USB cameras, each by its node with pictures (index 0)."""
+    """List all USB cameras, each by its node with images (index 0)."""
     found = []
     for node in sorted(root.glob("video*"), key=lambda n: (len(n.name), n.name)):
         if _read_text(node / "index") != "0":

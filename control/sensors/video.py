@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from touchgoal.control.interfaces import Frame
+from touchgoal.control.sensors.image_integrity import FrozenParts, JpegDecoder
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.control.sensors.picture_integrity import FrozenParts, JpegDecoder
 from touchgoal.runtime.errors import UserError
 
 _OPEN_TIMEOUT = 5.0  # s to open it the first time: the first frame may take longer to come
@@ -32,7 +32,7 @@ _JPEG = b"\xff\xd8"  # first bytes of a JPEG
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """Source of pictures and how to read it."""
+    """Source of images and how to read it."""
 
     # index of a camera (`0`), device (`/dev/video2`) or address of an MJPEG stream (`http://...`)
     source: str
@@ -43,12 +43,12 @@ class VideoConfig:
     exposure: float | None = None
     white_balance: int | None = None
     timeout: float = 1.0  # s without a frame after which a stream counts as lost, to open again
-    # s after which an identical picture, or part of one, counts as old; infinity for rendered
-    # pictures, which lack the noise of real ones
+    # s after which an identical image, or part of one, counts as old; infinity for rendered
+    # images, which lack the noise of real ones
     frozen_after: float = 0.5
-    # number of identical pictures in a row that must also have come before they count as old; for a
+    # number of identical images in a row that must also have come before they count as old; for a
     # lock-step twin, whose time is not the wall clock's
-    frozen_pictures: int = 0
+    frozen_images: int = 0
     # looks `source` up at each opening, for a serial number
     device: Callable[[], str] | None = None
 
@@ -108,7 +108,7 @@ class VideoCamera:
         self._count = 0
         self._image: np.ndarray | None = None
         self._frozen_parts, self._decoder = FrozenParts(), JpegDecoder()
-        self._same, self._frozen = 0, False  # pictures in a row with an unchanged part
+        self._same, self._frozen = 0, False  # images in a row with an unchanged part
         self._lost = self._refused = ""
         self._closed = False
         self._latest = LatestValue(f"camera {config.source}", self._take)
@@ -121,7 +121,7 @@ class VideoCamera:
             return f"{self.config.source} {wrong}"
         if self._frozen:
             still = now - frame.stamp
-            return f"{self.config.source} or a part of it shows one picture for {still:.1f} s"
+            return f"{self.config.source} or a part of it shows one image for {still:.1f} s"
         if now - frame.stamp > _LATE_PERIODS / self.config.rate:
             return f"{self.config.source} gave its last frame {now - frame.stamp:.2f} s ago"
         return ""
@@ -154,18 +154,18 @@ class VideoCamera:
         same_since = self._frozen_parts.update(image, stamp)
         self._same = self._same + 1 if same_since < stamp else 0
         still = stamp - same_since > self.config.frozen_after
-        self._frozen = still and self._same > self.config.frozen_pictures
+        self._frozen = still and self._same > self.config.frozen_images
         return Frame(image, self._count, same_since if self._frozen else stamp)
 
     def _checked(self, image: np.ndarray) -> np.ndarray | None:
-        """Return a grabbed JPEG or BGR picture as RGB; None if it is broken or of another size."""
+        """Return a grabbed JPEG or BGR image as RGB; None if it is broken or of another size."""
         if image.ndim == 2 and 1 in image.shape:
             decoded = self._decoder.decode(image.tobytes())
         else:
             decoded = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         before, self._refused = self._image, ""
         if decoded is None:
-            self._refused = "sends broken pictures: check its cable"
+            self._refused = "sends broken images: check its cable"
         elif before is not None and decoded.shape != before.shape:
             was, now = (f"{x.shape[1]}x{x.shape[0]}" for x in (before, decoded))
             self._refused = f"sends {now} pixels instead of {was}: check that it is the same camera"

@@ -1,4 +1,4 @@
-"""Background of a sensor: its untouched picture, followed as the light drifts."""
+"""Background of a sensor: its untouched image, followed as the light drifts."""
 
 import sys
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.fft import dct
 
-from touchgoal.control.arrays import AnyPicture, Counts, Picture, Pictures
+from touchgoal.control.arrays import AnyImage, Counts, Image, Images
 from touchgoal.control.tactile.light_gain import GAIN_SPREAD, LARGE_CHANGE, divide_gain, light_gain
 from touchgoal.runtime.errors import UserError
 
-# Pictures are averaged over _CELL x _CELL pixels and then blurred. Measured on 320 x 240 frames:
+# Images are averaged over _CELL x _CELL pixels and then blurred. Measured on 320 x 240 frames:
 # pixel noise of 1 count leaves at most 0.45 counts of `local_change`, and a bump of shading that
 # falls off within 15 pixels (sigma 7.5) keeps half of its height.
 _CELL = 4
@@ -25,7 +25,7 @@ _RATE = 0.02  # weight of a new frame: a time constant of 2 s at 25 Hz, slower t
 # Standard deviations between 150,000 real touches of Minis (Tactile-MNIST), counts.
 _OFFSET_SPREAD, _PATTERN_SPREAD = 2.4, 2.4
 _MOVED = 1.5  # counts of local change among the first frames, more than noise alone makes
-_START = 5  # frames of which the untouched picture is the median
+_START = 5  # frames of which the untouched image is the median
 _SAME_SHAPE = 5.0  # counts of local change, above the strongest compression noise: more is a touch
 _JITTER = 1.0  # px by which a camera shakes; dots that move farther together are a touch
 
@@ -56,14 +56,14 @@ class Background:
     """Untouched frame of one sensor as it is now; `update` follows its drift.
 
     It begins with the median of RGB frames of the untouched sensor, better five or more. UserError
-    if the picture changes between the frames.
+    if the image changes between the frames.
     """
 
-    def __init__(self, frames: Pictures) -> None:
+    def __init__(self, frames: Images) -> None:
         first = np.median(frames, axis=0).astype(np.float32)
         if max(float(local_change(frame, first).max()) for frame in frames) > _MOVED:
             raise UserError(
-                "the touch sensor's picture changes while its background is taken: "
+                "the touch sensor's image changes while its background is taken: "
                 "keep it still and untouched, and start again"
             )
         self.steady, self._frames = first.copy(), len(frames)
@@ -74,7 +74,7 @@ class Background:
         """Current background, counts."""
         return self.steady * self._gain
 
-    def update(self, frame: Picture) -> None:
+    def update(self, frame: Image) -> None:
         """Follow the drift by an untouched frame; the first 50 weigh the same."""
         self._frames += 1
         rate = max(_RATE, 1 / self._frames)
@@ -97,13 +97,13 @@ class Background:
         return Drift(1 + gain, offset, pattern.astype(np.float64))
 
 
-def untouched_frames(frames: Pictures) -> UInt8[np.ndarray, "k h w 3"]:
-    """Return the five frames from which a recording's untouched picture is taken: see `first_steady`."""
+def untouched_frames(frames: Images) -> UInt8[np.ndarray, "k h w 3"]:
+    """Return the five frames from which a recording's untouched image is taken: see `first_steady`."""
     first = first_steady(frames)
     return frames[first : first + _START]
 
 
-def first_steady(frames: Pictures, name: str = "") -> int:
+def first_steady(frames: Images, name: str = "") -> int:
     """Return the first frame after the exposure has settled; until then the light alone changes.
 
     It is looked for among the first 15 frames, if there are as many, and told on stderr if a `name`
@@ -115,12 +115,12 @@ def first_steady(frames: Pictures, name: str = "") -> int:
         while first < SETTLES_WITHIN - _START and _settling(frames[first], later):
             first += 1
     if first and name:
-        left_out = f"frames 0 to {first - 1} are left out of the untouched picture"
+        left_out = f"frames 0 to {first - 1} are left out of the untouched image"
         print(f"{name}: {left_out}: the light of those after them differs", file=sys.stderr)
     return first
 
 
-def _settling(frame: Picture, later: Picture) -> bool:
+def _settling(frame: Image, later: Image) -> bool:
     """Return whether the light, and nothing else, differs from a later frame's."""
     gain = light_gain(frame, later)
     if (np.abs(gain - 1) < LARGE_CHANGE).all():
@@ -128,11 +128,11 @@ def _settling(frame: Picture, later: Picture) -> bool:
     return float(local_change(divide_gain(frame, gain), later).max()) < _SAME_SHAPE
 
 
-def local_change(frame: AnyPicture, background: AnyPicture) -> Float32[np.ndarray, "H W"]:
+def local_change(frame: AnyImage, background: AnyImage) -> Float32[np.ndarray, "H W"]:
     """Return the change from the background that neither light nor jitter explains, counts.
 
     Low spatial frequencies and a factor on the background are fitted to each channel of the blurred
-    difference, and one shift of the whole picture by up to a pixel to all of them. They are
+    difference, and one shift of the whole image by up to a pixel to all of them. They are
     subtracted; what is left is its norm over the channels, at a quarter of the resolution.
     """
     reference = _blurred(background)
@@ -147,7 +147,7 @@ def local_change(frame: AnyPicture, background: AnyPicture) -> Float32[np.ndarra
 def _shifted(
     change: Float32[np.ndarray, "H W 3"], structure: Float32[np.ndarray, "H W 3"]
 ) -> Float32[np.ndarray, "H W 3"]:
-    """Return the part of a change that a small shift of the whole picture explains."""
+    """Return the part of a change that a small shift of the whole image explains."""
     kernel = np.array([[-0.5, 0, 0.5]], np.float32) / _CELL
     sides = [
         cv2.filter2D(structure, -1, k, borderType=cv2.BORDER_REPLICATE) for k in (kernel, kernel.T)

@@ -1,9 +1,9 @@
-"""Contact of a fingertip, from its pictures alone."""
+"""Contact of a fingertip, from its images alone."""
 
 import numpy as np
 from jaxtyping import Float32
 
-from touchgoal.control.arrays import Picture, Pictures
+from touchgoal.control.arrays import Image, Images
 from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.light_gain import remove_gain
 
@@ -16,7 +16,7 @@ _FEWEST_FRAMES = 3  # of these that differ
 _LEARNING_QUANTILE = 0.3
 _OVER_NOISE = 1.8  # multiple of the usual noise below which any contact ends
 _LEARNING_THRESHOLD = 5.0  # counts; the strongest compression noise measured had a strength of 2.5
-# Strength of a change per its median over the picture, above which it is no noise: Gaussian noise
+# Strength of a change per its median over the image, above which it is no noise: Gaussian noise
 # reaches 6, presses of balls on a real Mini 16 to 25.
 _NOISE_PEAK = 8.0
 _RELEASE = 0.1  # share of a contact's peak strength at which it ends
@@ -29,7 +29,7 @@ class ContactDetector:
     below half of it, so that it does not flicker, or below a tenth of the contact's peak, because
     the light drifts on during a long one. Without a threshold it is learned from the noise of the
     first 10 frames, during which only a strong contact counts: 5 counts, and eight times the median
-    over the picture, because noise is everywhere.
+    over the image, because noise is everywhere.
     """
 
     def __init__(self, background: Background, threshold: float | int | None = None) -> None:
@@ -42,7 +42,7 @@ class ContactDetector:
         self._peak = 0.0  # strength
         self._latest = np.rint(background.steady).astype(np.uint8)  # frame learned from
 
-    def update(self, frame: Picture) -> bool:
+    def update(self, frame: Image) -> bool:
         """Process the next frame and return whether it is in contact."""
         rest = self.background.steady
         change = local_change(remove_gain(frame, rest), rest)
@@ -59,7 +59,7 @@ class ContactDetector:
             self.background.update(frame)
         return self.touching
 
-    def _learn(self, frame: Picture) -> None:
+    def _learn(self, frame: Image) -> None:
         """Estimate the sensor's noise from its first untouched frames, of which repeats show none."""
         if self._untouched is None:
             return
@@ -74,13 +74,13 @@ class ContactDetector:
             self._untouched = None
 
 
-def contact_strength(frames: Pictures, background: Picture) -> Float32[np.ndarray, " n"]:
+def contact_strength(frames: Images, background: Image) -> Float32[np.ndarray, " n"]:
     """Return the largest `local_change` (counts) of each RGB frame from the same sensor untouched."""
     changes = (local_change(remove_gain(frame, background), background) for frame in frames)
     return np.array([change.max() for change in changes], np.float32)
 
 
-def threshold_for(untouched: Pictures, background: Picture) -> float:
+def threshold_for(untouched: Images, background: Image) -> float:
     """Return the contact threshold (counts) for a sensor with the noise of these frames.
 
     Compressed streams have a strength of 1 to 2. Fewer than half of the frames may be in contact.

@@ -1,7 +1,7 @@
-"""Depth of a gel from a picture, by inverting the sensor file's model.
+"""Depth of a gel from an image, by inverting the sensor file's model.
 
 One colour may belong to two slopes, to a shadow or to a depth, so Gauss-Newton steps find the
-surface whose picture (`sensor_calibration.shade`) fits the frame. A step is a Poisson-like equation
+surface whose image (`sensor_calibration.shade`) fits the frame. A step is a Poisson-like equation
 with free (Neumann) borders, solved by conjugate gradients that the cosine transform preconditions.
 Coarse grids come first: they cost little.
 """
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from touchgoal.control.arrays import Counts, Map, Picture
+from touchgoal.control.arrays import Counts, Image, Map
 from touchgoal.control.tactile import depth_steps
 from touchgoal.control.tactile.background import cosines
 from touchgoal.control.tactile.light_gain import remove_gain
@@ -25,7 +25,7 @@ Colours = Float32[np.ndarray, "3 h w"]
 
 _SCHEDULE = ((8, 5, 3), (4, 3, 2), (2, 1, 0))  # (cell's side in px, steps, of these with a search)
 _INNER = 5  # conjugate gradient steps to a Gauss-Newton step
-_MODEL_ERROR = 0.5  # counts by which a perfect calibration still differs from the picture
+_MODEL_ERROR = 0.5  # counts by which a perfect calibration still differs from the image
 _OUTLIER = 4.0  # standard deviations beyond which a pixel counts less
 _DAMPING = 0.01  # share of the usual curvature
 # Prior where colours leave the depth open: the lowest tenth of the surface is gel at rest, within
@@ -55,7 +55,7 @@ class DepthEstimator:
         self._schedule = [step for step in _SCHEDULE if step[0] >= finest]
         self._levels = [_Level(calibration, cell) for cell, *_ in self._schedule]
 
-    def estimate(self, image: Picture, background: Counts | None = None) -> Map:
+    def estimate(self, image: Image, background: Counts | None = None) -> Map:
         """Return the depth of the gel below its rest plane in an RGB frame, m, positive inwards.
 
         The background is the untouched sensor now (`Background.image`), or else the sensor file's.
@@ -72,7 +72,7 @@ class DepthEstimator:
 
 
 class _Level:
-    """Picture model and its inverse at one cell size."""
+    """Image model and its inverse at one cell size."""
 
     def __init__(self, calibration: SensorCalibration, cell: int) -> None:
         p = self._calibration = calibration
@@ -120,7 +120,7 @@ class _Level:
     def _linearise(
         self, target: Colours, surface: Map, search: bool
     ) -> tuple[Colours, Colours, Colours, Colours, Map]:
-        """Return the picture's error (counts), its derivatives by slopes and depth, and weights."""
+        """Return the image's error (counts), its derivatives by slopes and depth, and weights."""
         p = self._calibration
         gx, gy = np.empty_like(surface), np.empty_like(surface)
         depth_steps.slopes(surface, self._half, gx, gy)

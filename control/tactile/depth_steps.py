@@ -1,4 +1,4 @@
-"""Compiled parts of one Gauss-Newton step from a gel's picture towards its surface (see `depth`).
+"""Compiled parts of one Gauss-Newton step from a gel's image towards its surface (see `depth`).
 
 Shapes: maps are (rows, columns), colours (3, rows, columns), all float32.
 """

@@ -1,6 +1,6 @@
-"""Wear of a gel, seen on its untouched picture: torn, scratched or dirty.
+"""Wear of a gel, seen on its untouched image: torn, scratched or dirty.
 
-The operator of MMWand looks at the gel after each press; here the picture, corrected for light, is
+The operator of MMWand looks at the gel after each press; here the image, corrected for light, is
 compared with the gel's first one.
 """
 
@@ -10,13 +10,13 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.markers.tracker import find_markers, without_markers
 from touchgoal.control.tactile.sensor_models import SensorModel
 
-# Strength of a change: counts, and multiple of the picture's median. Between untouched pictures of one
+# Strength of a change: counts, and multiple of the image's median. Between untouched images of one
 # gel the strongest change in simulation is 1.0 counts and 3.9 times the median (single frames, light
 # changed by 5 %). Of 408 pairs of real videos in a row (PhysiCLeAR, medians of 5 compressed frames) 22
 # exceed both: dust and scratches that came between them, and the corners of the case.
@@ -29,10 +29,10 @@ _HOLE, _HOLE_WIDTH = 40.0, 1e-3  # counts, m: a dust grain is as strong, but sma
 
 @dataclass(frozen=True)
 class GelWear:
-    """Strongest change of a gel since its first picture."""
+    """Strongest change of a gel since its first image."""
 
     kind: Literal["torn", "scratched", "dirty"]  # what it looks like
-    place: tuple[float, float]  # (x, y) of its middle from the picture's top left corner, m
+    place: tuple[float, float]  # (x, y) of its middle from the image's top left corner, m
     length: float  # its longer side, m
 
     def __str__(self) -> str:
@@ -42,16 +42,16 @@ class GelWear:
         )
         return (
             f"the gel looks {self.kind}, {1e3 * self.length:.1f} mm long at {x:.0f} mm from the left and "
-            f"{y:.0f} mm from the top of its picture: {remedy}"
+            f"{y:.0f} mm from the top of its image: {remedy}"
         )
 
 
-def find_wear(untouched: Picture, first: Picture, sensor: SensorModel) -> GelWear | None:
-    """Compare a gel's untouched RGB picture with its first one; None if it has not changed.
+def find_wear(untouched: Image, first: Image, sensor: SensorModel) -> GelWear | None:
+    """Compare a gel's untouched RGB image with its first one; None if it has not changed.
 
     Dots are painted over. UserError if a gel with dots shows none.
     """
-    now, before = (_without_dots(picture, sensor) for picture in (untouched, first))
+    now, before = (_without_dots(image, sensor) for image in (untouched, first))
     change = local_change(remove_gain(now, before), before)
     rows, columns = change.shape
     inner = np.zeros_like(change)
@@ -72,9 +72,9 @@ def find_wear(untouched: Picture, first: Picture, sensor: SensorModel) -> GelWea
     return GelWear(kind, ((x + 0.5) * cell, (y + 0.5) * cell), length * cell)
 
 
-def _without_dots(picture: Picture, sensor: SensorModel) -> Picture:
+def _without_dots(image: Image, sensor: SensorModel) -> Image:
     grid = sensor.markers
     if grid is None:
-        return picture
-    dots = find_markers(picture, grid, sensor.pixel_pitch)
-    return without_markers(picture, dots.positions, dots.largest_radius(grid))
+        return image
+    dots = find_markers(image, grid, sensor.pixel_pitch)
+    return without_markers(image, dots.positions, dots.largest_radius(grid))

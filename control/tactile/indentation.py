@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.depth import DepthEstimator
@@ -24,12 +24,12 @@ _READABLE = 0.8  # share of a depth that must be read
 class IndentationMeter:
     """Meter of one fingertip's indentation; `untouched` is an RGB frame before any contact."""
 
-    def __init__(self, sensor: SensorModel, untouched: Picture) -> None:
+    def __init__(self, sensor: SensorModel, untouched: Image) -> None:
         self._detector = ContactDetector(Background(untouched[None]))
         self._depth = DepthEstimator(load(sensor.sensor_file), _CELL)
         self._depth.estimate(untouched)  # compiled code is loaded now, not in a control loop
 
-    def measure(self, frame: Picture) -> float:
+    def measure(self, frame: Image) -> float:
         """Return the deepest point of the next frame, m; 0 without contact."""
         if not self._detector.update(frame):
             return 0.0
@@ -71,5 +71,5 @@ def _read_ball(sensor: SensorModel, depth: float) -> float:
     surface = deform(
         np.maximum(ball, 0).astype(np.float32), calibration.pixel_pitch, calibration.blur_sigmas
     )
-    picture = np.clip(np.rint(shade(calibration, surface)), 0, 255).astype(np.uint8)
-    return float(DepthEstimator(calibration, _CELL).estimate(picture).max())
+    image = np.clip(np.rint(shade(calibration, surface)), 0, 255).astype(np.uint8)
+    return float(DepthEstimator(calibration, _CELL).estimate(image).max())

@@ -1,7 +1,7 @@
-"""Light of a fingertip: its change since the untouched picture, measured and taken out.
+"""Light of a fingertip: its change since the untouched image, measured and taken out.
 
 An LED that warms up, or a camera's exposure, multiplies each colour channel by a factor. Whatever
-compares a picture with an untouched one divides by that factor first, with `remove_gain`.
+compares an image with an untouched one divides by that factor first, with `remove_gain`.
 """
 
 from collections.abc import Sequence
@@ -10,26 +10,26 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from touchgoal.control.arrays import AnyPicture, Counts
+from touchgoal.control.arrays import AnyImage, Counts
 from touchgoal.control.features import TACTILE, Observation
 
 GAIN_SPREAD = 0.047
 """Standard deviation of a channel's brightness between 150,000 real touches of Minis (Tactile-MNIST)."""
 LARGE_CHANGE = 2 * GAIN_SPREAD
 """Change of a channel's brightness beyond what training has shown, as a share."""
-_ROWS = 32  # rows of cells in a picture, at most; 30 x 40 cells at 240 x 320
+_ROWS = 32  # rows of cells in an image, at most; 30 x 40 cells at 240 x 320
 _DARK, _BRIGHT = 16.0, 250.0  # counts below which noise matters, and above which pixels clip
 _LEAST_CELLS = 0.05  # least share of usable cells for a channel's gain to be measured
-_LEAST_GAIN = 0.04  # gain of an almost black picture
+_LEAST_GAIN = 0.04  # gain of an almost black image
 
 
-def light_gain(picture: AnyPicture, untouched: AnyPicture) -> Float32[np.ndarray, "3"]:
-    """Return the factor of each channel's brightness between two RGB pictures of a fingertip.
+def light_gain(image: AnyImage, untouched: AnyImage) -> Float32[np.ndarray, "3"]:
+    """Return the factor of each channel's brightness between two RGB images of a fingertip.
 
     It is the median ratio over a grid of cells, so a contact of less than half the gel does not
     change it. Cells that are dark or clipped do not count; a channel without other cells has 1.
     """
-    now, before = _cells(picture), _cells(untouched)
+    now, before = _cells(image), _cells(untouched)
     usable = (before > _DARK) & (before < _BRIGHT) & (now < _BRIGHT)
     ratios = now / np.maximum(before, 1)
     gain = np.ones(3, np.float32)
@@ -41,38 +41,38 @@ def light_gain(picture: AnyPicture, untouched: AnyPicture) -> Float32[np.ndarray
     return np.maximum(gain, _LEAST_GAIN)
 
 
-def remove_gain(picture: AnyPicture, untouched: AnyPicture) -> Counts:
-    """Return a picture as it would look in the light of the untouched one, counts."""
-    return divide_gain(picture, light_gain(picture, untouched))
+def remove_gain(image: AnyImage, untouched: AnyImage) -> Counts:
+    """Return an image as it would look in the light of the untouched one, counts."""
+    return divide_gain(image, light_gain(image, untouched))
 
 
-def divide_gain(picture: AnyPicture, gain: Float32[np.ndarray, "3"]) -> Counts:
-    """Return a picture without a known gain."""
-    rows, columns, _ = picture.shape
+def divide_gain(image: AnyImage, gain: Float32[np.ndarray, "3"]) -> Counts:
+    """Return an image without a known gain."""
+    rows, columns, _ = image.shape
     factors = np.tile(1 / gain, columns)  # whole rows at once: three times faster
-    return (picture.reshape(rows, -1) * factors).reshape(picture.shape)
+    return (image.reshape(rows, -1) * factors).reshape(image.shape)
 
 
-def _cells(picture: AnyPicture) -> Float32[np.ndarray, "3 n"]:
+def _cells(image: AnyImage) -> Float32[np.ndarray, "3 n"]:
     """Return the means of each channel over parts of every n-th row: a grid of cells, as a list."""
-    step = max(picture.shape[0] // _ROWS, 1)
-    rows = picture[::step].astype(np.float32)
-    size = max(picture.shape[1] // step, 1), len(rows)
+    step = max(image.shape[0] // _ROWS, 1)
+    rows = image[::step].astype(np.float32)
+    size = max(image.shape[1] // step, 1), len(rows)
     return cv2.resize(rows, size, interpolation=cv2.INTER_AREA).reshape(-1, 3).T
 
 
 class LightWatch:
-    """Largest change of the fingertips' light since the first picture of an episode.
+    """Largest change of the fingertips' light since the first image of an episode.
 
     `change` is of the channel that changed most, as a share; -0.15 is 15 % dimmer.
     """
 
     def __init__(self) -> None:
         self.change = 0.0
-        self._first: dict[str, AnyPicture] = {}
+        self._first: dict[str, AnyImage] = {}
 
     def update(self, observation: Observation) -> None:
-        """Take the fingertips' pictures of an observation into account; the first are untouched."""
+        """Take the fingertips' images of an observation into account; the first are untouched."""
         for key in TACTILE:
             if key in observation:
                 first = self._first.setdefault(key, observation[key])
@@ -91,6 +91,6 @@ def light_advice(changes: Sequence[float]) -> str:
     where = f" in {len(large)} of {len(changes)} episodes" if len(changes) > 1 else ""
     return (
         f"the fingertips' light changed by up to {max(large, key=abs):+.0%} after the first "
-        f"picture{where}; it is corrected, but sensors in training differ by {LARGE_CHANGE:.0%} at "
+        f"image{where}; it is corrected, but sensors in training differ by {LARGE_CHANGE:.0%} at "
         "most: let the lamps warm up, fix exposure and white balance, and start again"
     )

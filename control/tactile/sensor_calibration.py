@@ -11,7 +11,7 @@ from -1 to 1 across columns and rows, and shadow depths s_l of `gel.shadow_depth
     )
 
 The gain is the blurred background divided by its mean, to the power `illumination_exponent`: where
-little light falls, slopes change the picture little. (A real Mini fits 2, not 1: scattered light
+little light falls, slopes change the image little. (A real Mini fits 2, not 1: scattered light
 fills the background where the lamps do not reach; with 1 its balls read up to 40 % too flat in the
 corners.) The polynomial holds only within the presses: a normal steeper than `max_slope` is
 shortened to it, a depth beyond `max_depth` counts as `max_depth`.
@@ -29,11 +29,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from touchgoal.control.arrays import Counts, Map, Picture
+from touchgoal.control.arrays import Counts, Image, Map
 from touchgoal.control.tactile import gel
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture, write_picture
+from touchgoal.runtime.image_file import read_image, write_image
 
 N_FEATURES = 10
 PLACES = {2: 3, 3: 5}
@@ -47,7 +47,7 @@ class SensorCalibration:
     """Colours of one sensor, as `touchgoal calibrate` fits them to presses: the sensor file."""
 
     sensor: str  # name of the sensor model
-    background: Picture  # the untouched sensor, RGB
+    background: Image  # the untouched sensor, RGB
     pixel_pitch: float  # m per pixel
     # counts per channel and feature (`shape_features`); the last axis multiplies `position_terms`
     response: Float32[np.ndarray, "3 10 places"]
@@ -64,7 +64,7 @@ class SensorCalibration:
     illumination_exponent: float = 1.0
 
 
-def illumination(background: Picture, illumination_exponent: float = 1.0) -> Counts:
+def illumination(background: Image, illumination_exponent: float = 1.0) -> Counts:
     """Return the strength of the response over the image, per channel relative to the mean."""
     light = cv2.GaussianBlur(background.astype(np.float32), (0, 0), background.shape[1] / 40)
     light = (light / light.mean((0, 1))) ** np.float32(illumination_exponent)
@@ -170,7 +170,7 @@ def save(calibration: SensorCalibration, folder: Path, provenance: dict[str, Any
     version = next(n for n, places in PLACES.items() if places == calibration.response.shape[2])
     description = {"format": version, "image_shape": [rows, columns], **numbers}
     text = json.dumps({**description, "provenance": provenance}, indent=1)
-    write_picture(folder / _BACKGROUND, calibration.background)
+    write_image(folder / _BACKGROUND, calibration.background)
     one_line_lists = _INNERMOST.sub(lambda m: " ".join(m[0].split()), text)
     write_file(folder / _JSON, f"{one_line_lists}\n".encode())
 
@@ -188,9 +188,9 @@ def load(folder: Path) -> SensorCalibration:
     if version not in PLACES:
         known = " and ".join(map(str, PLACES))
         raise UserError(f"{path} has format {version}, this touchgoal reads {known}: {_MAKE}")
-    image = read_picture(folder / _BACKGROUND)
+    image = read_image(folder / _BACKGROUND)
     if image is None:
-        raise UserError(f"{folder / _BACKGROUND} is missing or no picture: {_MAKE}")
+        raise UserError(f"{folder / _BACKGROUND} is missing or no image: {_MAKE}")
     if list(image.shape[:2]) != description.get("image_shape"):
         raise UserError(
             f"{folder / _BACKGROUND} has {image.shape[:2]} rows and columns, {path} says "

@@ -67,7 +67,7 @@ GELSIGHT_MINI = SensorModel(
     sensor_file=_FILES / "gelsight_mini",
 )
 
-# 63 dots found in three real pictures: pitch 31.4-32.5 px, diameter 14-18 px of 320, round figures
+# 63 dots found in three real images: pitch 31.4-32.5 px, diameter 14-18 px of 320, round figures
 # in millimetres at the scale above.
 GELSIGHT_MINI_MARKERS = replace(
     GELSIGHT_MINI,
@@ -95,7 +95,7 @@ GELSIGHT_MARKERS = replace(
 
 # Image: QVGA at 60 Hz, upright as digit-interface returns it. Sensor file: one unit fitted to 20
 # presses of one ball (FOTS); ball (3 mm) and scale are assumed, because no source states them and
-# pictures do not show them. Sources range from 0.0405 (gs_sdk, at VGA) over 0.0511 (FOTS) to 0.0667
+# images do not show them. Sources range from 0.0405 (gs_sdk, at VGA) over 0.0511 (FOTS) to 0.0667
 # (a 16 x 19 mm sensing field). Case 32.3 x 27 x 34 mm: its STL. Gel 20 x 30 mm: TACTO, which also
 # bends it by 5 mm (R 100 mm); flat here. Thickness and moduli are not published: a third thinner
 # than the Mini's, of the same silicone.
@@ -115,12 +115,12 @@ DIGIT = SensorModel(
     sensor_file=_FILES / "digit",
 )
 
-# A finger whose camera sees the gel at an angle (Wang et al. 2021, arXiv 2106.08851); its picture
+# A finger whose camera sees the gel at an angle (Wang et al. 2021, arXiv 2106.08851); its image
 # is that between the gel's corners, which differ from unit to unit. Scale: a round number that may
-# be a tenth too small. With it, golf ball dimples in EstimateModulus' pictures are 3.9 mm apart;
-# 300 to 400 dimples on a ball would be 4.1 to 4.7 mm apart. Frame rate: that of these pictures.
-# Gel: as large as the picture; case: a margin around it. Thickness and moduli were not found: the
-# Mini's. Sensor file: computed from lamp positions, because no pictures of rigid
+# be a tenth too small. With it, golf ball dimples in EstimateModulus' images are 3.9 mm apart;
+# 300 to 400 dimples on a ball would be 4.1 to 4.7 mm apart. Frame rate: that of these images.
+# Gel: as large as the image; case: a margin around it. Thickness and moduli were not found: the
+# Mini's. Sensor file: computed from lamp positions, because no images of rigid
 # balls may be shipped.
 GELSIGHT_WEDGE = replace(
     GELSIGHT_MINI,

@@ -1,7 +1,7 @@
 """Green screen: cut out the foreground, and put another background behind it (MMWand, Figure 3).
 
 The screen is recognised by its chromaticity, the share of each colour in a pixel, which shading and
-shadows hardly change. Its own chromaticity is found in the picture, so light of another tint needs
+shadows hardly change. Its own chromaticity is found in the image, so light of another tint needs
 no setting.
 """
 
@@ -13,26 +13,26 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture
+from touchgoal.runtime.image_file import read_image
 
-Picture = UInt8[np.ndarray, "h w 3"]
+Image = UInt8[np.ndarray, "h w 3"]
 Alpha = Float32[np.ndarray, "h w"]
 
 _NEAR, _FAR = 0.035, 0.09  # distance from the screen's chromaticity: surely screen, surely not
 _DARK = 12  # counts, sum of the colours, below which a pixel's chromaticity is unreliable
 _GREEN = 0.45  # least share of green in a screen
-_LEAST_GREEN = 0.05  # least share of a picture that a screen takes up
+_LEAST_GREEN = 0.05  # least share of an image that a screen takes up
 _SMALLEST = 6  # px: specks below this area are noise
 _SIZE = 224, 224  # rows and columns of a random background
-_PICTURES = (".png", ".jpg", ".jpeg")
+_IMAGES = (".png", ".jpg", ".jpeg")
 
 
 Shares = Float32[np.ndarray, "2"]  # shares of red and green in a colour
 
 
-def screen_chromaticity(picture: Picture) -> Shares | None:
+def screen_chromaticity(image: Image) -> Shares | None:
     """Return the commonest colour among the green pixels; None where hardly anything is green."""
-    shares, bright = _chromaticity(picture)
+    shares, bright = _chromaticity(image)
     green = bright & (shares[..., 1] > _GREEN)
     if green.mean() < _LEAST_GREEN:
         return None
@@ -41,19 +41,19 @@ def screen_chromaticity(picture: Picture) -> Shares | None:
     return np.median(shares[green][index.ravel() == count.argmax()], axis=0).astype(np.float32)
 
 
-def foreground(picture: Picture, known: Shares | None = None) -> Alpha:
+def foreground(image: Image, known: Shares | None = None) -> Alpha:
     """Return the foreground's share of each pixel, 0 to 1.
 
     UserError: no green screen is seen, nor is its colour known.
 
     Args:
-        known: the screen's colour in other pictures, for one in which an object hides the screen.
+        known: the screen's colour in other images, for one in which an object hides the screen.
     """
-    screen = screen_chromaticity(picture)
+    screen = screen_chromaticity(image)
     screen = known if screen is None else screen
     if screen is None:
-        raise UserError(f"no green screen: less than {_LEAST_GREEN:.0%} of the picture is green")
-    shares, bright = _chromaticity(picture)
+        raise UserError(f"no green screen: less than {_LEAST_GREEN:.0%} of the image is green")
+    shares, bright = _chromaticity(image)
     away = np.linalg.norm(shares - screen, axis=2)
     alpha = np.clip((away - _NEAR) / (_FAR - _NEAR), 0, 1)
     alpha[~bright] = 1  # black is no screen: a screen in shadow is still green
@@ -61,71 +61,71 @@ def foreground(picture: Picture, known: Shares | None = None) -> Alpha:
 
 
 def replace_background(
-    picture: Picture, background: UInt8[np.ndarray, "H W 3"], known: Shares | None = None
-) -> Picture:
-    """Return the picture's foreground on another background of any size, see `foreground`."""
-    h, w = picture.shape[:2]
-    alpha = foreground(picture, known)[..., None]
+    image: Image, background: UInt8[np.ndarray, "H W 3"], known: Shares | None = None
+) -> Image:
+    """Return the image's foreground on another background of any size, see `foreground`."""
+    h, w = image.shape[:2]
+    alpha = foreground(image, known)[..., None]
     behind = cv2.resize(background, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32)
-    mixed = alpha * _without_spill(picture, alpha[..., 0]) + (1 - alpha) * behind
+    mixed = alpha * _without_spill(image, alpha[..., 0]) + (1 - alpha) * behind
     return np.clip(mixed + 0.5, 0, 255).astype(np.uint8)
 
 
-def read_backgrounds(folder: Path) -> list[Picture]:
-    """Read all pictures of a folder; UserError if it has none."""
-    paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in _PICTURES)
+def read_backgrounds(folder: Path) -> list[Image]:
+    """Read all images of a folder; UserError if it has none."""
+    paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in _IMAGES)
     if not paths:
-        raise UserError(f"no pictures in {folder}: give a folder of {', '.join(_PICTURES)}")
-    pictures = [(path, read_picture(path)) for path in paths]
-    if bad := [path.name for path, picture in pictures if picture is None]:
-        raise UserError(f"{folder}: {', '.join(bad)} cannot be read as a picture")
-    return [picture for _, picture in pictures if picture is not None]
+        raise UserError(f"no images in {folder}: give a folder of {', '.join(_IMAGES)}")
+    images = [(path, read_image(path)) for path in paths]
+    if bad := [path.name for path, image in images if image is None]:
+        raise UserError(f"{folder}: {', '.join(bad)} cannot be read as an image")
+    return [image for _, image in images if image is not None]
 
 
-def random_background(rng: np.random.Generator) -> Picture:
+def random_background(rng: np.random.Generator) -> Image:
     """Draw a background: coloured clouds of several sizes, and a few edges as of furniture."""
     h, w = _SIZE
-    picture = np.full((h, w, 3), rng.uniform(30, 220, 3), np.float32)
+    image = np.full((h, w, 3), rng.uniform(30, 220, 3), np.float32)
     for cells in (2, 5, 12, 30):
         clouds = rng.normal(0, 90 / np.sqrt(cells), (cells, cells, 3)).astype(np.float32)
-        picture += cv2.resize(clouds, (w, h), interpolation=cv2.INTER_CUBIC)
+        image += cv2.resize(clouds, (w, h), interpolation=cv2.INTER_CUBIC)
     for _ in range(int(rng.integers(0, 6))):
         corners = rng.uniform(-0.2, 1.2, (4, 2)) * (w, h)
         hull = cv2.convexHull(corners.astype(np.int32))
-        shade = np.array(picture)
+        shade = np.array(image)
         cv2.fillConvexPoly(shade, hull, rng.uniform(20, 235, 3).tolist(), cv2.LINE_AA)
-        picture = cv2.addWeighted(picture, 0.4, shade, 0.6, 0)
-    return np.clip(picture, 0, 255).astype(np.uint8)
+        image = cv2.addWeighted(image, 0.4, shade, 0.6, 0)
+    return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def background_changer(backgrounds: str, seed: int) -> Callable[[Picture], Picture]:
-    """Return a function that replaces a picture's background by random ones.
+def background_changer(backgrounds: str, seed: int) -> Callable[[Image], Image]:
+    """Return a function that replaces an image's background by random ones.
 
-    UserError: the folder has no pictures.
+    UserError: the folder has no images.
 
     Args:
-        backgrounds: "screen" leaves it as it is, "generated" draws them, or a folder of pictures.
+        backgrounds: "screen" leaves it as it is, "generated" draws them, or a folder of images.
     """
     if backgrounds == "screen":
-        return lambda picture: picture
+        return lambda image: image
     rng = np.random.default_rng(seed)
     known: Shares | None = None
-    pictures = None if backgrounds == "generated" else read_backgrounds(Path(backgrounds))
+    images = None if backgrounds == "generated" else read_backgrounds(Path(backgrounds))
 
-    def change(picture: Picture) -> Picture:
+    def change(image: Image) -> Image:
         nonlocal known
-        screen = screen_chromaticity(picture)
+        screen = screen_chromaticity(image)
         known = known if screen is None else screen
-        behind = pictures[rng.integers(len(pictures))] if pictures else random_background(rng)
-        return replace_background(picture, behind, known)
+        behind = images[rng.integers(len(images))] if images else random_background(rng)
+        return replace_background(image, behind, known)
 
     return change
 
 
-def _chromaticity(picture: Picture) -> tuple[Float32[np.ndarray, "h w 2"], Bool[np.ndarray, "h w"]]:
+def _chromaticity(image: Image) -> tuple[Float32[np.ndarray, "h w 2"], Bool[np.ndarray, "h w"]]:
     """Return the shares of red and green, and where they can be trusted."""
-    total = picture.astype(np.float32).sum(2)
-    return picture[..., :2] / np.maximum(total, 1)[..., None], total > _DARK
+    total = image.astype(np.float32).sum(2)
+    return image[..., :2] / np.maximum(total, 1)[..., None], total > _DARK
 
 
 def _without_specks(alpha: Alpha) -> Alpha:
@@ -140,9 +140,9 @@ def _without_specks(alpha: Alpha) -> Alpha:
     return alpha
 
 
-def _without_spill(picture: Picture, alpha: Alpha) -> Float32[np.ndarray, "h w 3"]:
+def _without_spill(image: Image, alpha: Alpha) -> Float32[np.ndarray, "h w 3"]:
     """Take the screen's green out of mixed pixels; solid ones keep their own green."""
-    out = picture.astype(np.float32)
+    out = image.astype(np.float32)
     edge = cv2.dilate((alpha < 1).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     limit = (out[..., 0] + out[..., 2]) / 2
     out[..., 1] = np.where(

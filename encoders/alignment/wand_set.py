@@ -1,4 +1,4 @@
-"""Touches by the wand, read as training data: pictures, views, objects and sentences."""
+"""Touches by the wand, read as training data: images, views, objects and sentences."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float32, Int
 
 from touchgoal.control import features as ft
-from touchgoal.control.arrays import Picture, Pictures
+from touchgoal.control.arrays import Image, Images
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import Touches
@@ -71,23 +71,23 @@ class WandSet:
         test = np.isin(self.visit, draw_held_out(rng, np.unique(self.visit)))
         return np.flatnonzero(~test), np.flatnonzero(test)
 
-    def pictures(self, i: int) -> tuple[Picture, Picture]:
-        """Return the untouched and the firmest picture of a touch, RGB."""
+    def images(self, i: int) -> tuple[Image, Image]:
+        """Return the untouched and the firmest image of a touch, RGB."""
         last = self.episodes.lengths[i] - 1
         untouched, touched = self.episodes.read(i, [ft.TACTILE_LEFT], [0, last]).frames[
             ft.TACTILE_LEFT
         ]
         return untouched, touched
 
-    def view(self, i: int) -> Picture:
+    def view(self, i: int) -> Image:
         """Return the wand's own view before contact, RGB."""
         return self.episodes.read(i, [ft.WAND_VIEWS[-1]], [0]).frames[ft.WAND_VIEWS[-1]][0]
 
     def touches(self, rows: Int[np.ndarray, " r"]) -> Touches:
-        """Return the firmest pictures of some touches, with their views, as training data. Slow."""
+        """Return the firmest images of some touches, with their views, as training data. Slow."""
         reading = track(rows, "reading touches", "touch", len(rows))
-        pictures = [(*self.pictures(int(i)), self.view(int(i))) for i in reading]
-        untouched, touched, views = (np.stack(kind) for kind in zip(*pictures, strict=True))
+        images = [(*self.images(int(i)), self.view(int(i))) for i in reading]
+        untouched, touched, views = (np.stack(kind) for kind in zip(*images, strict=True))
         index = np.arange(len(rows))
         objects = tuple(self.names[i] for i in self.label[rows])
         sentences = self.sentences_by_object()
@@ -101,17 +101,17 @@ class WandSet:
         }
 
     def embed_touches(
-        self, embed: Callable[[Pictures, Picture], Float32[np.ndarray, "_ d"]]
+        self, embed: Callable[[Images, Image], Float32[np.ndarray, "_ d"]]
     ) -> Float32[np.ndarray, "n d"]:
-        """Embed the firmest pictures by a function of pictures and their untouched one. Slow."""
+        """Embed the firmest images by a function of images and their untouched one. Slow."""
         rows = []
         for i in track(range(len(self)), "embedding touches", "touch"):
-            untouched, touched = self.pictures(i)
+            untouched, touched = self.images(i)
             rows.append(embed(touched[None], untouched)[0])
         return np.stack(rows).astype(np.float32)
 
     def embed_views(
-        self, towers: Towers, change: Callable[[Picture], Picture] = lambda view: view
+        self, towers: Towers, change: Callable[[Image], Image] = lambda view: view
     ) -> Float32[np.ndarray, "n 1 i"]:
         """Embed the wand's own view before contact, which shows the place to be touched.
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.encoders.alignment.described_touches import DescribedTouches
 from touchgoal.encoders.alignment.heads import Heads
@@ -22,7 +22,7 @@ _PRESSES = 2  # presses of each surface
 
 
 def embed_wand(
-    encoder: PooledEncoder, data: WandSet, towers: Towers, change: Callable[[Picture], Picture]
+    encoder: PooledEncoder, data: WandSet, towers: Towers, change: Callable[[Image], Image]
 ) -> DescribedTouches:
     """Embed the touches of the wand and, after a change, their views; UserError: of another sensor."""
     check_sensor(data.episodes, 0, encoder.config.sensor)

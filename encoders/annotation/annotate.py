@@ -21,7 +21,7 @@ from touchgoal.encoders.annotation.records import (
 from touchgoal.encoders.annotation.sensor_tracking import track_csrt
 from touchgoal.episodes.importers.visgel import VisGelRecording
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture
+from touchgoal.runtime.image_file import read_image
 from touchgoal.runtime.progress import track
 
 ANNOTATIONS, LEFT_OUT = "annotations.jsonl", "left_out.jsonl"
@@ -140,7 +140,7 @@ def _find_sensor(
 
 
 def _read(path: Path) -> Image:
-    image = read_picture(path)
+    image = read_image(path)
     if image is None:
         raise LeftOut("an image is missing or unreadable")
     return image

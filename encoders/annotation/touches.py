@@ -10,10 +10,10 @@ from jaxtyping import UInt8
 from touchgoal.control.tactile.sensor_models import find_model
 from touchgoal.encoders.annotation.boxes import square_crop
 from touchgoal.encoders.annotation.records import AnnotatedTouch, read_annotations
-from touchgoal.episodes.importers.touch_clip import read_picture_file
+from touchgoal.episodes.importers.touch_clip import read_image_file
 from touchgoal.episodes.touches import Touches
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture
+from touchgoal.runtime.image_file import read_image
 from touchgoal.runtime.progress import track
 
 _VIEW = 224  # px
@@ -72,12 +72,12 @@ def open_annotations(data: Path, validation: Path, sensor: str | None) -> tuple[
 
 def _tactile(path: str, sensor: str) -> UInt8[np.ndarray, "h w 3"]:
     height, width = find_model(sensor).image_shape
-    frame = read_picture_file(Path(path), sensor)
+    frame = read_image_file(Path(path), sensor)
     return cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _view(record: AnnotatedTouch) -> UInt8[np.ndarray, "h w 3"]:
-    image = read_picture(Path(record.image))
+    image = read_image(Path(record.image))
     if image is None:
         raise UserError(f"{record.image} is missing or unreadable: annotate again")
     return square_crop(image, record.instances[record.touched].box, _VIEW)

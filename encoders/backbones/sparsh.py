@@ -12,7 +12,7 @@ from touchgoal.encoders.preprocess import preprocessor_for
 
 Method = Literal["mae", "dino", "ijepa", "vjepa"]
 
-# Pictures there stand upright; the LayerNorm's epsilon is in no file of weights.
+# Images there stand upright; the LayerNorm's epsilon is in no file of weights.
 UPRIGHT, SQUARE, NORM_EPSILON = (320, 240), (224, 224), 1e-6
 
 

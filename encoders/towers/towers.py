@@ -20,7 +20,7 @@ from touchgoal.encoders.towers.wheels import wheel_folder
 from touchgoal.runtime.errors import UserError
 
 BATCH = 32
-_CPU_PICTURES = 4  # images that a core takes at a time
+_CPU_IMAGES = 4  # images that a core takes at a time
 _SIDE = 224  # px, shorter side of an image for the ImageNet network
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 T = TypeVar("T")
@@ -146,7 +146,7 @@ class OfflineTowers:
             return embed(pixels.to(self.device, memory_format=torch.channels_last))
 
         if self.device == "cpu":
-            return _on_all_cores(run, images, _CPU_PICTURES)
+            return _on_all_cores(run, images, _CPU_IMAGES)
         return _in_batches(run, images)
 
     @torch.no_grad()

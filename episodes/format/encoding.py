@@ -36,7 +36,7 @@ from touchgoal.episodes.schema import (
 )
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import decode_picture
+from touchgoal.runtime.image_file import decode_image
 
 FRAMES_PER_ROW_GROUP = 32  # reading one window of touch reads a few groups, not the whole episode
 _FOOTER_KEY, _CHECKSUM_KEY = b"touchgoal", b"touchgoal.crc32"
@@ -112,7 +112,7 @@ def encode_png(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
 
 def decode_png(png: bytes) -> UInt8[np.ndarray, "h w 3"]:
     """Return the RGB image of a PNG file."""
-    image = decode_picture(png, "an image in the data file")
+    image = decode_image(png, "an image in the data file")
     if image is None:
         raise UserError("an image in the data file is no readable PNG")
     return image

@@ -48,7 +48,7 @@ class LabelledVideo:
 
     def frame_checksums(self) -> frozenset[int]:
         """Return checksums of the images, comparable in this process."""
-        return frozenset(hash(picture.tobytes()) for picture in self.frames())
+        return frozenset(hash(image.tobytes()) for image in self.frames())
 
     def open(self) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "h w 3"]]:
         """Decode the images, and the untouched sensor: the median of the first five."""

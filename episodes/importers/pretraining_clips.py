@@ -26,8 +26,8 @@ from jaxtyping import UInt8
 from touchgoal.episodes.importers.touch_clip import (
     TouchClip,
     check_sensor,
-    read_picture_file,
-    read_pictures,
+    read_image_file,
+    read_images,
 )
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
@@ -51,19 +51,19 @@ class Recording:
 
     def frame_checksums(self) -> frozenset[int]:
         """Return checksums of the encoded images, comparable in this process."""
-        return frozenset(hash(picture) for picture in read_pictures(self.path))
+        return frozenset(hash(image) for image in read_images(self.path))
 
     def open(self) -> tuple[TouchClip, UInt8[np.ndarray, "h w 3"]]:
         """Read the images, and the untouched sensor.
 
         UserError: the file is damaged, or `bgs/` holds images of another size.
         """
-        clip = TouchClip(str(self.path), self.sensor, read_pictures(self.path), self.exchanged)
+        clip = TouchClip(str(self.path), self.sensor, read_images(self.path), self.exchanged)
         median = clip.median_image()
         if not self.backgrounds:
             return clip, median
-        found = [read_picture_file(path, self.sensor) for path in self.backgrounds]
-        fitting = [picture for picture in found if picture.shape == median.shape]
+        found = [read_image_file(path, self.sensor) for path in self.backgrounds]
+        fitting = [image for image in found if image.shape == median.shape]
         if not fitting:
             raise UserError(
                 f"no image in {self.backgrounds[0].parent} has the size of {self.path}'s: "
@@ -103,7 +103,7 @@ def _gelsights(folder: Path, sensor: str | None) -> list[Recording]:
         if paths := sorted(p for p in folder.glob("*.pkl") if re.fullmatch(pattern, p.name)):
             named = check_sensor(sensor, sensors, folder)
             files = track(paths, f"files of {folder.name}", "file")
-            length = {path: len(read_pictures(path)) for path in files}
+            length = {path: len(read_images(path)) for path in files}
             order = sorted(paths, key=lambda path: -length[path])
             trained = order[: min(max(round(_TRAINED * len(paths)), 1), len(paths) - 1)]
             exchanged = sensors[0] == "gelsight_markers"

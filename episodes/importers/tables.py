@@ -1,4 +1,4 @@
-"""Tables and pictures of published sets of touches."""
+"""Tables and images of published sets of touches."""
 
 import csv
 from collections.abc import Iterable

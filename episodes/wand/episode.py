@@ -12,7 +12,7 @@ from touchgoal.control.tactile.gel_wear import GelWear
 from touchgoal.control.wand_touch import CLIP, WandTouch
 from touchgoal.episodes.schema import Episode
 
-FPS = 25  # pictures a second of a GelSight Mini
+FPS = 25  # images a second of a GelSight Mini
 SET = "wand"  # meta: where the touches of a set come from; sets of another origin are not continued
 _BEFORE = 2  # frames of a clip that show the views before contact
 

@@ -7,11 +7,11 @@ from contextlib import closing
 from pathlib import Path
 
 from touchgoal.control import features as ft
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.cell.wand import Wand, WandConfig, connect_wand
 from touchgoal.control.cell.wand_recorder import WandRecorder
 from touchgoal.control.interfaces import DriverError
-from touchgoal.control.tactile.picture_guard import check_untouched
+from touchgoal.control.tactile.image_guard import check_untouched
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.control.wand_touch import FORCE_RANGES, WandTouch, force_range
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
@@ -19,7 +19,7 @@ from touchgoal.episodes.wand.episode import FPS, SET, Visit, wand_episode
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import stop_on_request
 
-_POLL_INTERVAL = 0.004  # s between looks for a new picture
+_POLL_INTERVAL = 0.004  # s between looks for a new image
 _WIDTH = 100  # characters of the terminal's line
 
 
@@ -56,7 +56,7 @@ def record_real_touches(
         visit = Visit(origin, sensor.name, name, descriptions, gel, number)
         recorder = WandRecorder(sensor, first, counts)
         with closing(connect_wand(config)) as wand, stop_on_request() as stopped:
-            check_untouched(wand.gel.read().image, sensor, "the picture of the wand's gel")
+            check_untouched(wand.gel.read().image, sensor, "the image of the wand's gel")
             _Session(writer, visit, recorder, wand).run(stopped, count)
     return EpisodeSet(root) if len(writer) else None
 
@@ -132,8 +132,8 @@ class _StatusLine:
 
 def _continued(
     episodes: EpisodeSet | None, origin: str, new_gel: bool
-) -> tuple[int, int, Picture | None]:
-    """Return the gel's number, the visit's, and the gel's first picture if the set has one."""
+) -> tuple[int, int, Image | None]:
+    """Return the gel's number, the visit's, and the gel's first image if the set has one."""
     if episodes is None:
         return 0, 0, None
     meta = [episodes.meta(i) for i in range(len(episodes))]

@@ -87,7 +87,7 @@ def _random_touch(env: TouchWand) -> Touch:
 def _episode(
     env: TouchWand, visit: Visit, first: UInt8[np.ndarray, "h w 3"], camera: np.random.Generator
 ) -> Episode:
-    """Touch the object once, and look at the gel afterwards; `first` is its first picture."""
+    """Touch the object once, and look at the gel afterwards; `first` is its first image."""
     touch = _random_touch(env)
     wear = find_wear(env.untouched(camera), first, find_sensor(visit.sensor))
     episode = wand_episode(touch, visit, wear)

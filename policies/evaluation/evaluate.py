@@ -44,7 +44,7 @@ class Trial:
             position.
         seconds: length.
         clamped: share of the ticks whose action was beyond the arm's or the gripper's limits.
-        light_change: largest change of a fingertip's light since the first picture, as a share.
+        light_change: largest change of a fingertip's light since the first image, as a share.
         episode: what distinguishes it, such as the object, its mass, or the wire.
     """
 

@@ -99,12 +99,12 @@ def _film(
 ) -> Path | None:
     name, spec = job
     env = make_env(task)  # with the same images, because rendering them draws random numbers
-    episode, pictures = record_with_film(env, spec, policy, "fast", on_tick)
+    episode, images = record_with_film(env, spec, policy, "fast", on_tick)
     env.close()
     if out is None:
         return None
     path = out / f"{name}.mp4"
-    write_film(path, pictures, episode, task.control_hz)
+    write_film(path, images, episode, task.control_hz)
     return path
 
 
@@ -112,10 +112,10 @@ def _shown_in(stream: RerunStream, name: str, hz: int) -> OnTick:
     """Return what logs each tick; where the front camera is not rendered, the film's scene is."""
     frames = count()
 
-    def show(tick: dict[str, np.ndarray], picture: np.ndarray) -> None:
+    def show(tick: dict[str, np.ndarray], image: np.ndarray) -> None:
         images, scalars = parts_of(tick, name)
         if ft.FRONT not in tick:
-            images = {f"{name}/scene": picture[:, : len(picture)], **images}
+            images = {f"{name}/scene": image[:, : len(image)], **images}
         frame = next(frames)
         stream.log(frame, frame / hz, images, scalars)
 

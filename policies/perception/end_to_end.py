@@ -30,8 +30,8 @@ def difference_images(
     small = []
     for frame in frames:
         change = np.rint(remove_gain(frame, first)) - first + _ZERO
-        picture = np.clip(change, 0, 255).astype(np.uint8)
-        small.append(cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA))
+        image = np.clip(change, 0, 255).astype(np.uint8)
+        small.append(cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA))
     return np.stack(small)
 
 
@@ -43,8 +43,8 @@ class EndToEndEncoder(nn.Module):
         vit = ViTConfig(image_size=config.size, width=128, depth=4, heads=4)
         self.vit, self.projection = ViT(vit), nn.Linear(vit.width, config.width)
 
-    def forward(self, pictures: UInt8[Tensor, "b k h w 3"]) -> Float[Tensor, "b e"]:
+    def forward(self, frames: UInt8[Tensor, "b k h w 3"]) -> Float[Tensor, "b e"]:
         """Return the embedding of a tick with an image of each of `features.TACTILE`."""
-        count = pictures.shape[1]
-        images = (pictures.flatten(0, 1).permute(0, 3, 1, 2).float() - _ZERO) / _SCALE
+        count = frames.shape[1]
+        images = (frames.flatten(0, 1).permute(0, 3, 1, 2).float() - _ZERO) / _SCALE
         return self.projection(self.vit.features(images)).unflatten(0, (-1, count)).flatten(1)

@@ -42,7 +42,7 @@ class Placements:
     A missing object, or one that no sentence distinguishes from the others, has sentence -1.
     """
 
-    pictures: dict[str, UInt8[Tensor, "n h w 3"]]  # camera images by column
+    images: dict[str, UInt8[Tensor, "n h w 3"]]  # camera images by column
     tcp: Float32[Tensor, "n 7"]  # pose of the hand, `features.TCP_POSE`
     start: Float32[Tensor, "n k 7"]  # true poses with each as target, `features.TRUTH_START`
     # of each object's centre, and last of the goal's, in each camera image: row and column, px
@@ -71,19 +71,19 @@ def render_placements(
     seeds = range(seed, seed + scenes)
     keys = [ft.IMAGE_PREFIX + camera for camera in config.cameras]
     shape = scenes * placements_each, *config.camera_size, 3
-    pictures = {key: torch.empty(shape, dtype=torch.uint8) for key in keys}
+    images = {key: torch.empty(shape, dtype=torch.uint8) for key in keys}
     rows: list[dict[str, Any]] = []
     with parallel_map(
         partial(_render_scene, config, placements_each, variety), seeds, workers
     ) as some:
         for row in chain.from_iterable(track(some, "rendering", "scene", total=scenes)):
             for key in keys:  # the only large arrays, so no second copy
-                pictures[key][len(rows)] = torch.from_numpy(row.pop(key))
+                images[key][len(rows)] = torch.from_numpy(row.pop(key))
             rows.append(row)
     sentences = sorted({words for row in rows for words in row["words"] if words})
     number = {words: i for i, words in enumerate(sentences)} | {None: -1}
     return Placements(
-        pictures=pictures,
+        images=images,
         tcp=_column(rows, ft.TCP_POSE),
         start=_column(rows, "start"),
         pixels={key: _column(rows, f"pixels.{key}") for key in keys},

@@ -29,7 +29,7 @@ _PEAK = 1.5  # cells around a map's maximum over which the place is averaged
 _FIRST = 1.5
 _BRIGHTNESS, _MOST_GAIN = 110.0, 6.0  # grey levels of 255, the mean of the usual image
 
-Pictures = dict[str, UInt8[Tensor, "b h w 3"]]
+Images = dict[str, UInt8[Tensor, "b h w 3"]]
 Places = dict[str, Float[Tensor, "b 2 2"]]
 """Row and column (px) of the object and of the goal in each camera image."""
 
@@ -73,16 +73,16 @@ class PoseEstimator(nn.Module):
         self.heads = nn.ModuleList(readout(width, config.width, part) for part in _PARTS)
 
     def forward(
-        self, pictures: Pictures, tcp: Float[Tensor, "b 7"], words: Float[Tensor, "b d"]
+        self, images: Images, tcp: Float[Tensor, "b 7"], words: Float[Tensor, "b d"]
     ) -> Float[Tensor, "b 7"]:
         """Return the estimate: m, base frame.
 
         `words` are `target_words.embed`; zeros without a sentence, where one object is there.
         """
-        lit = evenly_lit(pictures)
+        lit = evenly_lit(images)
         return self.look(lit, words, self.scene(lit, tcp)).start
 
-    def scene(self, lit: Pictures, tcp: Float[Tensor, "b 7"]) -> Float[Tensor, "b s"]:
+    def scene(self, lit: Images, tcp: Float[Tensor, "b 7"]) -> Float[Tensor, "b s"]:
         """Encode the camera's pose from the whole image and the hand's pose."""
         known = [self.tcp_normalizer(tcp)]
         for (key, _), scene in zip(self.config.crops, self.scenes, strict=True):
@@ -91,7 +91,7 @@ class PoseEstimator(nn.Module):
             known.append(scene(halved, middle.expand(len(halved), -1)))
         return torch.cat(known, 1)
 
-    def look(self, lit: Pictures, words: Float[Tensor, "b d"], scene: Float[Tensor, "b s"]) -> Look:
+    def look(self, lit: Images, words: Float[Tensor, "b d"], scene: Float[Tensor, "b s"]) -> Look:
         """Find object and goal in evenly lit images; `scene` may be of the episode's first images."""
         scores = self.scores(lit, words)
         found = {key: _find(scores[key], box) for key, box in self.config.crops}
@@ -101,11 +101,11 @@ class PoseEstimator(nn.Module):
         return Look(start, surest, start[:, 3:5].norm(dim=1))
 
     def scores(
-        self, pictures: Pictures, words: Float[Tensor, "b d"]
+        self, images: Images, words: Float[Tensor, "b d"]
     ) -> dict[str, Float[Tensor, "b 2 y x"]]:
         """Return logits of where the object and the goal are in each camera image."""
         return {
-            key: finder(pictures[key], words)
+            key: finder(images[key], words)
             for (key, _), finder in zip(self.config.crops, self.finders, strict=True)
         }
 
@@ -114,7 +114,7 @@ class PoseEstimator(nn.Module):
         return {key: _shares(places[key], box) for key, box in self.config.crops}
 
     def scaled(
-        self, pictures: Pictures, scene: Float[Tensor, "b s"], places: Places
+        self, images: Images, scene: Float[Tensor, "b s"], places: Places
     ) -> Float[Tensor, "b 7"]:
         """Return the estimate from crops around these places, normalised to variance 1."""
         estimate = []
@@ -122,15 +122,15 @@ class PoseEstimator(nn.Module):
             found = [scene]
             for (key, _), looks in zip(self.config.crops, self.looks, strict=True):
                 look = cast(nn.ModuleList, looks)[part]
-                found.append(look(pictures[key], places[key][:, part]))
+                found.append(look(images[key], places[key][:, part]))
             estimate.append(head(torch.cat(found, 1)))
         return torch.cat(estimate, 1)
 
 
-def evenly_lit(pictures: Pictures) -> Pictures:
+def evenly_lit(images: Images) -> Images:
     """Return images of the same mean brightness, by a gain of at most 6."""
     lit = {}
-    for key, some in pictures.items():
+    for key, some in images.items():
         mean = some[:, ::4, ::4].float().mean((1, 2, 3), keepdim=True)
         gain = (_BRIGHTNESS / mean).clamp(0.5, _MOST_GAIN)
         # One at a time, which stays in the processor's cache.
@@ -139,8 +139,8 @@ def evenly_lit(pictures: Pictures) -> Pictures:
     return lit
 
 
-def _pixels(pictures: UInt8[Tensor, "b h w 3"]) -> Float[Tensor, "b 3 h w"]:
-    return pictures.permute(0, 3, 1, 2).float() / 64 - 2
+def _pixels(images: UInt8[Tensor, "b h w 3"]) -> Float[Tensor, "b 3 h w"]:
+    return images.permute(0, 3, 1, 2).float() / 64 - 2
 
 
 class _Surroundings(nn.Module):
@@ -169,10 +169,10 @@ class _Finder(nn.Module):
         self.words = nn.Linear(WORDS_WIDTH, width, bias=False)
 
     def forward(
-        self, pictures: UInt8[Tensor, "b h w 3"], words: Float[Tensor, "b d"]
+        self, images: UInt8[Tensor, "b h w 3"], words: Float[Tensor, "b d"]
     ) -> Float[Tensor, "b 2 y x"]:
         top, bottom, left, right = self.box
-        maps = self.patches(_pixels(pictures[:, top:bottom, left:right]))
+        maps = self.patches(_pixels(images[:, top:bottom, left:right]))
         maps = self.keys(F.relu(self.surroundings(self.cells(F.relu(maps)))))
         queries = self.queries.expand(len(maps), -1, -1)
         queries = queries + torch.stack([self.words(words), torch.zeros_like(queries[:, 1])], 1)
@@ -219,15 +219,15 @@ class _SpatialSoftmax(nn.Module):
         self.features = nn.Conv2d(width, config.keypoint_features, 1)
 
     def forward(
-        self, pictures: UInt8[Tensor, "b h w 3"], places: Float[Tensor, "b 2"]
+        self, images: UInt8[Tensor, "b h w 3"], places: Float[Tensor, "b 2"]
     ) -> Float[Tensor, "b p"]:
-        size = torch.tensor(pictures.shape[1:3], device=places.device)
+        size = torch.tensor(images.shape[1:3], device=places.device)
         corner = (places - self.side / 2).round().long()
         corner = corner.clamp(min=0).minimum(size - self.side)
         crops = torch.stack(
             [
-                picture[y : y + self.side, x : x + self.side]
-                for picture, (y, x) in zip(pictures, corner.tolist(), strict=True)
+                image[y : y + self.side, x : x + self.side]
+                for image, (y, x) in zip(images, corner.tolist(), strict=True)
             ]
         )
         maps = F.relu(self.surroundings(self.patches(_pixels(crops))))

@@ -48,9 +48,9 @@ def train_pose_estimator(
         target = (noise.rand((len(rows),)) * placements.objects[rows]).long()
         words, unambiguous = _words(placements, embedded, rows, target, noise)
         return {
-            "pictures": evenly_lit(
+            "images": evenly_lit(
                 {
-                    key: _add_pixel_noise(placements.pictures[key][rows], box, noise)
+                    key: _add_pixel_noise(placements.images[key][rows], box, noise)
                     for key, box in estimator.config.crops
                 }
             ),
@@ -62,7 +62,7 @@ def train_pose_estimator(
             "off": _PLACE_NOISE * (2 * noise.rand((len(rows), 2, 2)) - 1),
         }
 
-    tensors = (*placements.pictures.values(), *placements.pixels.values())
+    tensors = (*placements.images.values(), *placements.pixels.values())
     training = Training(
         loss=_PoseLoss(estimator),
         n_samples=len(placements),
@@ -88,7 +88,7 @@ class _PoseLoss(nn.Module):
 
     def forward(
         self,
-        pictures: dict[str, Tensor],
+        images: dict[str, Tensor],
         tcp: Tensor,
         start: Tensor,
         places: dict[str, Tensor],
@@ -97,12 +97,12 @@ class _PoseLoss(nn.Module):
         off: Tensor,
     ) -> dict[str, Tensor]:
         near = {key: place + off for key, place in places.items()}
-        scene = self.estimator.scene(pictures, tcp)
-        predicted = self.estimator.scaled(pictures, scene, near)
+        scene = self.estimator.scene(images, tcp)
+        predicted = self.estimator.scaled(images, scene, near)
         target = self.estimator.start_normalizer(start)
         pose = F.smooth_l1_loss(predicted, target, beta=_HUBER_BETA)
         few = slice(None, None, _FINDER_ROWS)  # the same rows in one process and in several
-        scores = self.estimator.scores({k: p[few] for k, p in pictures.items()}, words[few])
+        scores = self.estimator.scores({k: p[few] for k, p in images.items()}, words[few])
         shares = self.estimator.place_shares({k: p[few] for k, p in places.items()})
         find = torch.stack(
             [_find_loss(scores[k], shares[k], unambiguous[few]) for k in scores]
@@ -150,11 +150,11 @@ def _places(
 
 
 def _add_pixel_noise(
-    pictures: UInt8[Tensor, "b h w 3"], box: Box, noise: BatchNoise
+    images: UInt8[Tensor, "b h w 3"], box: Box, noise: BatchNoise
 ) -> UInt8[Tensor, "b h w 3"]:
     """Change the images in the box, and return them."""
     top, bottom, left, right = box
-    crop = pictures[:, top:bottom, left:right]
+    crop = images[:, top:bottom, left:right]
     added = noise.draw(
         len(crop),
         lambda n, g: torch.randint(
@@ -162,7 +162,7 @@ def _add_pixel_noise(
         ),
     )
     crop.copy_((crop + added).clamp(0, 255))
-    return pictures
+    return images
 
 
 @torch.no_grad()
@@ -234,7 +234,7 @@ def _look(
 ) -> Look:
     looks = []
     for some, chosen in zip(rows.split(_BATCH), words.split(_BATCH), strict=True):
-        lit = evenly_lit({key: pictures[some] for key, pictures in placements.pictures.items()})
+        lit = evenly_lit({key: images[some] for key, images in placements.images.items()})
         looks.append(estimator.look(lit, chosen, estimator.scene(lit, placements.tcp[some])))
     return Look(*(torch.cat([getattr(o, k) for o in looks]) for k in ("start", "found", "turned")))
 

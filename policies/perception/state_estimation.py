@@ -17,7 +17,7 @@ from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.config import PoseEstimatorConfig
-from touchgoal.policies.perception.pose_estimator import Pictures, PoseEstimator, evenly_lit
+from touchgoal.policies.perception.pose_estimator import Images, PoseEstimator, evenly_lit
 from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
 from touchgoal.runtime.errors import RefusedError, UserError
 
@@ -78,9 +78,9 @@ class StateEstimator:
         """Begin an episode: estimate its poses, store its untouched gels."""
         tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
         self._check_hand(tcp)
-        pictures = self._pictures(first)
-        self._scene = self.pose_estimator.scene(pictures, tcp)
-        look = self.pose_estimator.look(pictures, self._words, self._scene)
+        images = self._images(first)
+        self._scene = self.pose_estimator.scene(images, tcp)
+        look = self.pose_estimator.look(images, self._words, self._scene)
         for what, sure, least in zip(_ASKED, look.sureness, self._least, strict=True):
             if sure < least:
                 raise RefusedError(
@@ -97,7 +97,7 @@ class StateEstimator:
 
         The camera's pose is taken from the first images, in which nothing moves.
         """
-        look = self.pose_estimator.look(self._pictures(observation), self._words, self._scene)
+        look = self.pose_estimator.look(self._images(observation), self._words, self._scene)
         if any(sure < least for sure, least in zip(look.sureness, self._least, strict=True)):
             return
         now, before = look.start[0].numpy(), self._latest
@@ -117,19 +117,19 @@ class StateEstimator:
                 "estimator was trained: move it there (task.start of a cell file)"
             )
 
-    def _pictures(self, observation: Mapping[str, np.ndarray]) -> Pictures:
+    def _images(self, observation: Mapping[str, np.ndarray]) -> Images:
         """Return the evenly lit images of an observation."""
-        pictures = {}
+        images = {}
         for key in self.cameras:
-            picture, size = observation[key], self.camera_size
-            if picture.shape[:2] != size:
-                given, wanted = (f"{y} x {x}" for y, x in (picture.shape[:2], size))
+            image, size = observation[key], self.camera_size
+            if image.shape[:2] != size:
+                given, wanted = (f"{y} x {x}" for y, x in (image.shape[:2], size))
                 raise UserError(
                     f"{key} is {given}, the policy was trained on {wanted}: make the environment "
                     "with load_policy(...).env_config(), or set camera_size"
                 )
-            pictures[key] = torch.from_numpy(picture)[None]
-        return evenly_lit(pictures)
+            images[key] = torch.from_numpy(image)[None]
+        return evenly_lit(images)
 
 
 def load_pose_estimator(directory: Path) -> PoseEstimator:

@@ -32,7 +32,7 @@ class Recordings:
     state: Float32[Tensor, "n s"]  # proprioception
     actions: Float32[Tensor, "n 8"]  # `features.ACTION`
     lengths: tuple[int, ...]  # ticks of each episode
-    pictures: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
+    images: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
     wrench: Float32[Tensor, "n 12"] | None = None  # on both pads (N, Nm, pad frames), if trained on
     maps: Float16[Tensor, "n k c y x"] | None = None  # camera feature maps, see `ImageEmbedder`
     key_pose: Float32[Tensor, "n 3 8"] | None = None  # the last and the next two, beside `maps`
@@ -57,7 +57,7 @@ def load_recordings(
     images = ImageEmbedder(config.images) if config.images else None
     maps = embed_episodes(episodes, chosen, images, workers) if images else []
     keys = [*config.proprioception, ft.ACTION, *[ft.TRUTH_PAD_WRENCH] * config.reads_wrench]
-    touch, state, actions, pictures, wrench, tcp = [], [], [], [], [], []
+    touch, state, actions, differences, wrench, tcp = [], [], [], [], [], []
     for n, i in enumerate(track(chosen, "reading", "episode")):
         frames = episodes.read(i, keys).frames
         if ft.WRENCH in frames:
@@ -72,7 +72,7 @@ def load_recordings(
         no_touch = np.empty((len(actions[-1]), 0), np.float16)
         touch.append(embedded[n][start:] if embedded else no_touch)
         if config.end_to_end:
-            pictures.append(_difference_images(episodes, i, config.end_to_end)[start:])
+            differences.append(_difference_images(episodes, i, config.end_to_end)[start:])
     parts = [torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions)]
     lengths = tuple(len(rows) for rows in actions)
     key_pose, hold = None, round(HOLD_SECONDS * config.control_hz)
@@ -82,7 +82,7 @@ def load_recordings(
     return Recordings(
         *parts,
         lengths=lengths,
-        pictures=torch.from_numpy(np.concatenate(pictures)) if config.end_to_end else None,
+        images=torch.from_numpy(np.concatenate(differences)) if config.end_to_end else None,
         wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
         maps=_joined(maps, skip) if images else None,
         key_pose=key_pose,
@@ -193,10 +193,10 @@ class SequenceDataset:
     def take(self, rows: Int[Tensor, " b"]) -> tuple[ObservationBatch, Float[Tensor, "b h 8"]]:
         """Return observations and actions of some windows."""
         observed, recorded = self._observed[rows], self.recorded
-        pictures = None if recorded.pictures is None else recorded.pictures[rows]
+        images = None if recorded.images is None else recorded.images[rows]
         maps = None if recorded.maps is None else recorded.maps[rows]
         batch = ObservationBatch(
-            recorded.touch[observed].float(), recorded.state[observed], pictures, maps
+            recorded.touch[observed].float(), recorded.state[observed], images, maps
         )
         return batch, recorded.actions[self._planned[rows]]
 

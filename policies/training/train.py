@@ -127,7 +127,7 @@ class _PolicyLoss(nn.Module):
         self,
         touch: Float[Tensor, "b o e"],
         state: Float[Tensor, "b o s"],
-        pictures: Tensor | None,
+        images: Tensor | None,
         maps: Tensor | None,
         wrench: Float[Tensor, "b o 12"] | None,
         actions: Float[Tensor, "b h 8"],
@@ -135,7 +135,7 @@ class _PolicyLoss(nn.Module):
         key_pose: Float[Tensor, "b 3 8"] | None,
         noise: BatchNoise,
     ) -> dict[str, Tensor]:
-        batch = ObservationBatch(touch, state, pictures, maps)
+        batch = ObservationBatch(touch, state, images, maps)
         return {"loss": self.policy.loss(batch, actions, noise, wrench, action_is_pad, key_pose)}
 
 
@@ -144,7 +144,7 @@ def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, 
     return {
         "touch": observed.touch,
         "state": observed.state,
-        "pictures": observed.pictures,
+        "images": observed.images,
         "maps": observed.maps,
         "wrench": windows.wrench(rows),
         "actions": actions,
@@ -162,7 +162,7 @@ def _validation_batch(policy: PolicyNetwork, windows: SequenceDataset) -> dict[s
 
 
 def _observed(batch: dict[str, Any]) -> ObservationBatch:
-    return ObservationBatch(*(batch[name] for name in ("touch", "state", "pictures", "maps")))
+    return ObservationBatch(*(batch[name] for name in ("touch", "state", "images", "maps")))
 
 
 @torch.no_grad()
@@ -193,7 +193,7 @@ def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dic
 def _checksum(windows: SequenceDataset) -> str:
     recorded = windows.recorded
     return checksum(
-        recorded.touch, recorded.state, recorded.actions, recorded.pictures, recorded.wrench,
+        recorded.touch, recorded.state, recorded.actions, recorded.images, recorded.wrench,
         recorded.maps, recorded.key_pose, map(str, recorded.lengths), windows.weights,
     )  # fmt: skip
 

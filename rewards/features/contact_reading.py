@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.control.features import TACTILE, TRUTH_CONTACT
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector, threshold_for
@@ -63,7 +63,7 @@ class ContactReader:
         numbers = {"force": force, "centre": centre, "slip": slip}
         return readings | {name: np.array(n, np.float32) for name, n in numbers.items()}
 
-    def _read_frame(self, frame: Picture) -> tuple[bool, float, tuple[float, float]]:
+    def _read_frame(self, frame: Image) -> tuple[bool, float, tuple[float, float]]:
         touching = self._detector.update(frame)
         if self._depth is None or self._sensor is None or not touching:
             return touching, 0.0, (0.0, 0.0)
@@ -71,7 +71,7 @@ class ContactReader:
         force = estimate_force(depth, self._pitch, self._sensor)
         return touching, force, contact_centre(depth, self._pitch)
 
-    def _resized(self, frame: Picture) -> Picture:
+    def _resized(self, frame: Image) -> Image:
         if frame.shape[1::-1] == self._size:
             return frame
         return cv2.resize(frame, self._size, interpolation=cv2.INTER_AREA)

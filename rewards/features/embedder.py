@@ -12,7 +12,7 @@ from jaxtyping import Float32, UInt8
 
 from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT, WRENCH
 from touchgoal.control.tactile.background import first_steady, untouched_frames
-from touchgoal.control.tactile.picture_guard import check_unpressed, check_untouched
+from touchgoal.control.tactile.image_guard import check_unpressed, check_untouched
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.pretrained import AnyTouchEncoder

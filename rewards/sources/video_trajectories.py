@@ -23,7 +23,7 @@ from touchgoal.control.features import (
     TACTILE_RIGHT,
     WRIST,
 )
-from touchgoal.control.sensors.clip import PICTURES, VIDEOS, Clip, in_natural_order, open_clip
+from touchgoal.control.sensors.clip import IMAGES, VIDEOS, Clip, in_natural_order, open_clip
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.sources.trajectory import Skipped, Source, Trajectory, frames_per_chunk
@@ -117,7 +117,7 @@ def _find(path: Path, camera: str) -> dict[str, dict[str, Path]]:
         name = _split_name(path)[0] or path.parent.name
         return {name: _group(path.parent, camera).get(name, {camera: path})}
     entries = in_natural_order(path.iterdir())
-    if any(e.suffix.lower() in PICTURES for e in entries) or _named_by_role(path):
+    if any(e.suffix.lower() in IMAGES for e in entries) or _named_by_role(path):
         return {path.resolve().name: _files_of(path, camera)}
     found = _group(path, camera)
     for folder in entries:
@@ -132,7 +132,7 @@ def _files_of(folder: Path, camera: str) -> dict[str, Path]:
     """Return the files of one trajectory's folder by what they show; {} if it is none."""
     if files := _named_by_role(folder):
         return files
-    if any(entry.suffix.lower() in PICTURES for entry in folder.iterdir()):
+    if any(entry.suffix.lower() in IMAGES for entry in folder.iterdir()):
         return {camera: folder}
     groups = list(_group(folder, camera).values())
     return groups[0] if len(groups) == 1 else {}

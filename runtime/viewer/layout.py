@@ -1,4 +1,4 @@
-"""Layout of the rerun viewer: pictures on the left, plots on the right, one time axis for all."""
+"""Layout of the rerun viewer: images on the left, plots on the right, one time axis for all."""
 
 from collections.abc import Collection
 from itertools import cycle
@@ -34,7 +34,7 @@ def _tab(name: str, images: list[str], scalars: list[str]) -> Any:
 
     # pairs from the end: the fingertips come last, and stand side by side
     ends = range(len(images), 0, -2)
-    rows = [views.Horizontal(*map(_picture, images[max(0, end - 2) : end])) for end in ends]
+    rows = [views.Horizontal(*map(_image, images[max(0, end - 2) : end])) for end in ends]
     plots: dict[str, list[str]] = {}
     for path in scalars:
         plots.setdefault(path.rpartition("/")[0], []).append(path)
@@ -42,7 +42,7 @@ def _tab(name: str, images: list[str], scalars: list[str]) -> Any:
     return views.Horizontal(views.Vertical(*reversed(rows)), curves, name=name)
 
 
-def _picture(path: str) -> Any:
+def _image(path: str) -> Any:
     import rerun.blueprint as views  # pyright: ignore[reportMissingImports]
 
     return views.Spatial2DView(origin=_entity(path), name=path.rpartition("/")[2])

@@ -58,8 +58,8 @@ class RerunStream:
         if seconds is not None:
             self._recording.set_time("time", duration=seconds)
         for path, image in images.items():
-            picture = self._rerun.Image(np.asarray(image)).compress(jpeg_quality=_JPEG_QUALITY)
-            self._recording.log(path.split("/"), picture)
+            encoded = self._rerun.Image(np.asarray(image)).compress(jpeg_quality=_JPEG_QUALITY)
+            self._recording.log(path.split("/"), encoded)
         for path, value in scalars.items():
             self._recording.log(path.split("/"), self._rerun.Scalars(float(value)))
 

@@ -163,9 +163,9 @@ class DeployedArm:
         ticks = round(hardware.config.max_seconds * hz) + _AHEAD
         jitter = rng.uniform(*_range(deployment.jitter))
         self._state_at = _read_times(rng, deployment.state_delay, jitter, ticks, self._tick_ms)
-        period = 1000 / (deployment.picture_rate or 1000.0)
-        self._picture_at = _read_times(
-            rng, deployment.picture_delay, jitter, ticks, self._tick_ms, period
+        period = 1000 / (deployment.image_rate or 1000.0)
+        self._image_at = _read_times(
+            rng, deployment.image_delay, jitter, ticks, self._tick_ms, period
         )
         delays = _delays(rng, deployment.command_delay, jitter, ticks)
         # A command never overtakes the one before it.
@@ -175,7 +175,7 @@ class DeployedArm:
         self._commands: deque[tuple[int, Joints, float]] = deque()
         self._width = hardware.width_target()
         self._states = {0: self._read_state()}
-        self._pictures = {0: (hardware.take_pictures(), hardware.pad_contacts())}
+        self._images = {0: (hardware.take_images(), hardware.pad_contacts())}
         self.contacts = hardware.pad_contacts()  # at the time of the last observation's images
 
     def run_tick(self, delta: Joints, width: float) -> Joints:
@@ -189,7 +189,7 @@ class DeployedArm:
         self._tick += 1
         end = self._ms + self._tick_ms
         reads = self._moments(self._state_at, end)
-        shots = self._moments(self._picture_at, end)
+        shots = self._moments(self._image_at, end)
         too_high, speed = False, hardware.robot.tool.speed
         while self._ms < end and not too_high:
             while self._commands and self._commands[0][0] <= self._ms:
@@ -206,11 +206,11 @@ class DeployedArm:
 
     def observation(self) -> dict[str, np.ndarray]:
         """Return the policy's observation after the last tick."""
-        read, shot = int(self._state_at[self._tick]), int(self._picture_at[self._tick])
+        read, shot = int(self._state_at[self._tick]), int(self._image_at[self._tick])
         self._states, state = _latest(self._states, read)
-        self._pictures, (pictures, self.contacts) = _latest(self._pictures, shot)
-        age = (self._ms - (min(read, shot) if pictures else read)) * _DT
-        return {**state, **pictures, ft.AGE: np.array([age], np.float32)}
+        self._images, (images, self.contacts) = _latest(self._images, shot)
+        age = (self._ms - (min(read, shot) if images else read)) * _DT
+        return {**state, **images, ft.AGE: np.array([age], np.float32)}
 
     def _measure(self, read: bool, shoot: bool) -> None:
         hardware = self._hardware
@@ -223,7 +223,7 @@ class DeployedArm:
         if read:
             self._states[self._ms] = self._read_state()
         if shoot:
-            self._pictures[self._ms] = hardware.take_pictures(), hardware.pad_contacts()
+            self._images[self._ms] = hardware.take_images(), hardware.pad_contacts()
 
     def _read_state(self) -> dict[str, np.ndarray]:
         state = self._hardware.read_proprioception()

@@ -29,9 +29,9 @@ class DeploymentConfig:
     """Observe the force on the hand as a real arm estimates it: with noise, bias, drift and lag."""
     state_delay: DelayRange | None = None
     """Least and largest age of joint positions, velocities and force in an observation, s."""
-    picture_delay: DelayRange | None = None
+    image_delay: DelayRange | None = None
     """Least and largest age of camera and tactile images in an observation, s."""
-    picture_rate: Annotated[float | None, Field(ge=5, le=1000), FIXED] = None
+    image_rate: Annotated[float | None, Field(ge=5, le=1000), FIXED] = None
     """Frame rate of cameras and fingertip sensors, Hz. An observation holds the latest frame; as
     deployed 30 Hz, else one frame per millisecond."""
     command_delay: DelayRange | None = None
@@ -47,8 +47,8 @@ IDEAL_DEPLOYMENT = DeploymentConfig(
     franka_hand=False,
     estimated_wrench=False,
     state_delay=(0.0, 0.0),
-    picture_delay=(0.0, 0.0),
-    picture_rate=1000.0,
+    image_delay=(0.0, 0.0),
+    image_rate=1000.0,
     command_delay=(0.0, 0.0),
     jitter=(0.0, 0.0),
     plan_ticks=(0,),
@@ -61,8 +61,8 @@ AS_DEPLOYED = DeploymentConfig(
     franka_hand=True,
     estimated_wrench=True,
     state_delay=(0.005, 0.02),
-    picture_delay=(0.005, 0.02),
-    picture_rate=30.0,
+    image_delay=(0.005, 0.02),
+    image_rate=30.0,
     command_delay=(0.005, 0.02),
     jitter=(0.0, 0.02),
     plan_ticks=(1,),

@@ -299,7 +299,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
             self._force.check(observation[ft.WRENCH])  # as `deploy` does
             return observation | command
         age = {ft.AGE: np.zeros(1, np.float32)}
-        return self.read_proprioception() | self.take_pictures() | command | age
+        return self.read_proprioception() | self.take_images() | command | age
 
     def _read_command(self) -> Float32[np.ndarray, " c"]:
         velocity = (self.command - self._command_before) * self.config.control_hz

@@ -157,17 +157,17 @@ class SimulatedHardware(ABC):
         }
         return {key: value.astype(np.float32) for key, value in values.items()}
 
-    def take_pictures(self) -> Observation:
+    def take_images(self) -> Observation:
         """Render cameras and read fingertips; `update_contacts` first, in order of time."""
-        pictures = {
+        images = {
             ft.IMAGE_PREFIX + camera: self.render_camera(camera) for camera in self.config.cameras
         }
         if self.pads:
             # their last readings, with depth and contact mask
             self.tactile_frames = [self.read_tactile(side) for side in range(2)]
             for key, frame in zip(ft.TACTILE, self.tactile_frames, strict=True):
-                pictures[key] = frame.image
-        return pictures
+                images[key] = frame.image
+        return images
 
     def close(self) -> None:
         """Free the OpenGL contexts."""
@@ -178,7 +178,7 @@ class SimulatedHardware(ABC):
     def _show(self, model: mujoco.MjModel) -> None:
         """Put the renderer for a model first: one that can show it, else a new one.
 
-        A new one and its first picture take 17 ms. Two are kept, because objects with and without a
+        A new one and its first image take 17 ms. Two are kept, because objects with and without a
         mesh of their own take turns.
         """
         fits = next((r for r in self._renderers if r.show(model)), None)

@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.scene.rendering import open_renderer
 
-TICKS_PER_PICTURE = 2
+TICKS_PER_IMAGE = 2
 _HEIGHT = 240  # px
 
 
@@ -29,24 +29,24 @@ class SceneRecorder:
         self._data = mujoco.MjData(self._model)
         self._renderer = open_renderer(self._model, _HEIGHT, _HEIGHT)
         self._ticks = 0
-        self._pictures: list[np.ndarray] = []
+        self._images: list[np.ndarray] = []
 
     def capture(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the newest picture; call it once per tick, every second call draws one."""
+        """Return the newest image; call it once per tick, every second call draws one."""
         self._ticks += 1
-        if self._ticks % TICKS_PER_PICTURE != 1:
-            return self._pictures[-1]
+        if self._ticks % TICKS_PER_IMAGE != 1:
+            return self._images[-1]
         self._data.qpos[:] = self._env.data.qpos
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, "front")
         touch = [frame.image for frame in self._env.tactile_frames]
-        self._pictures.append(_beside(self._renderer.render(), touch))
-        return self._pictures[-1]
+        self._images.append(_beside(self._renderer.render(), touch))
+        return self._images[-1]
 
     @property
-    def pictures(self) -> UInt8[np.ndarray, "n h w 3"]:
-        """The pictures so far, one every `TICKS_PER_PICTURE` ticks."""
-        return np.stack(self._pictures)
+    def images(self) -> UInt8[np.ndarray, "n h w 3"]:
+        """The images so far, one every `TICKS_PER_IMAGE` ticks."""
+        return np.stack(self._images)
 
     def close(self) -> None:
         """Free the OpenGL context."""

@@ -10,7 +10,7 @@ _FEWEST = 100  # triangles; a mesh that would have fewer stays as it is
 def merge_corners(spec: mujoco.MjSpec, names: set[str], size: float) -> None:
     """Merge the corners of named meshes that lie in one cube of `size` m (Rossignac, Borrel 1993).
 
-    In software OpenGL, most of a picture's time goes to triangles smaller than a pixel.
+    In software OpenGL, most of an image's time goes to triangles smaller than a pixel.
     """
     model = spec.copy().compile()
     for mesh in [m for m in spec.meshes if m.name in names]:

@@ -73,7 +73,7 @@ def open_renderer(model: mujoco.MjModel, rows: int, columns: int) -> Renderer:
     global _opened_in
     if os.environ.get("MUJOCO_GL", "").lower() in ("disable", "disabled", "off", "false", "0"):
         raise UserError(
-            "pictures need OpenGL, which this machine lacks; run: "
+            "images need OpenGL, which this machine lacks; run: "
             f"sudo apt-get install {OPENGL_PACKAGES}"
         )
     try:

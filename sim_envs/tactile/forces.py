@@ -24,7 +24,7 @@ _MAX_CORRECTION = 0.9  # share of a cell's normal force
 # Where the patch cannot carry both, torsion yields to force.
 _REGULARIZATION, _REGULARIZATION_TORSION = 1e-5, 1e-3
 _FORCE_TOLERANCE = 1e-4  # share of the friction limit
-_SQUARES = 24  # rows and columns of a picture's tractions
+_SQUARES = 24  # rows and columns of an image's tractions
 _FINE = 4  # samples along each side of such a square
 
 
@@ -270,14 +270,14 @@ def force_field(
 
 
 def resample_to_image(
-    values: Float[np.ndarray, "h w"], field: ForceField, picture: Grid
+    values: Float[np.ndarray, "h w"], field: ForceField, image: Grid
 ) -> Float32[np.ndarray, "h2 w2"]:
     """Interpolate values on a field's cells onto a grid centred on the image; 0 beyond the gel."""
-    cells = field.pitch / picture.pitch  # image cells per gel cell
+    cells = field.pitch / image.pitch  # image cells per gel cell
     middle = np.array(values.shape[::-1]) / 2 - 0.5 - np.array(field.displacement[:2]) / field.pitch
-    shift = middle - (np.array([picture.columns, picture.rows]) / 2 - 0.5) / cells
+    shift = middle - (np.array([image.columns, image.rows]) / 2 - 0.5) / cells
     to_cells = np.column_stack([np.eye(2) / cells, shift])
-    size = picture.columns, picture.rows
+    size = image.columns, image.rows
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(values.astype(np.float32), to_cells, size, flags=flags)
 

@@ -7,7 +7,7 @@
     hold                            stop a lock-step twin's time until this connection closes
     advance STEPS DRIVEN COMMANDS   advance it by STEPS ms, once a client drives the arm (DRIVEN 1)
                                     and the hand has received COMMANDS commands since `hold`
-    pictures                        number of images sent on each stream, once all due ones are
+    images                        number of images sent on each stream, once all due ones are
     freeze SECONDS                  block arm and hand from their clients, for simulated SECONDS
     drop                            close the arm's connections
     stop-button on|off              user stop of a Franka, emergency stop of a UR
@@ -47,8 +47,8 @@ from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
+from touchgoal.sim_envs.twin.images import Images
 from touchgoal.sim_envs.twin.lock_step import LockStep
-from touchgoal.sim_envs.twin.pictures import Pictures
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort, Service
 from touchgoal.sim_envs.twin.ur.controller import UrController
@@ -68,7 +68,7 @@ class ControlPort(Service):
         self,
         cell: SimulatedCell,
         arm: FrankaArm | UrController,
-        pictures: Pictures,
+        images: Images,
         ports: dict[str, SerialPort],
         host: str,
         port: int,
@@ -76,7 +76,7 @@ class ControlPort(Service):
         on_reset: Callable[[], None],
     ) -> None:
         self._lock_step, self._on_reset = lock_step, on_reset
-        self._cell, self._arm, self._pictures, self._ports = cell, arm, pictures, ports
+        self._cell, self._arm, self._images, self._ports = cell, arm, images, ports
         self._listener = ListeningPort(host, port)
         self._lessee: ClientConnection | None = None  # the deployment that uses the twin
         self._frozen_seconds = 0.0  # s, simulated: else a slow machine would end it too soon
@@ -151,7 +151,7 @@ class ControlPort(Service):
                 self._held_time().advance(client, steps, bool(driven), commands)
                 return None
             if command == "pictures":
-                self._held_time().count_pictures(client)
+                self._held_time().count_images(client)
                 return None
             return actions[command]() or {"ok": True}
         except (UserError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
@@ -189,7 +189,7 @@ class ControlPort(Service):
         self._cell.nudge(np.array([x, y, z]), seconds)
 
     def _fault_stream(self, command: str, name: str, seconds: str) -> None:
-        self._pictures.set_fault(name, _STREAM_FAULTS[command], float(seconds))
+        self._images.set_fault(name, _STREAM_FAULTS[command], float(seconds))
 
     def _jam_gripper(self, width: float) -> None:
         self._cell.least_width = width

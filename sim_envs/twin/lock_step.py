@@ -10,7 +10,7 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand
-from touchgoal.sim_envs.twin.pictures import Pictures
+from touchgoal.sim_envs.twin.images import Images
 from touchgoal.sim_envs.twin.serial.devices import LoadCell
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection
 
@@ -31,24 +31,24 @@ class LockStep:
         cell: SimulatedCell,
         arm: FrankaArm,
         hand: FrankaHand,
-        pictures: Pictures,
+        images: Images,
         load_cell: LoadCell,
     ) -> None:
         self._load_cell = load_cell
-        self._cell, self._arm, self._hand, self._pictures = cell, arm, hand, pictures
+        self._cell, self._arm, self._hand, self._images = cell, arm, hand, images
         self._holder: ClientConnection | None = None
         self._left = 0  # steps asked for and not yet made
         self._driven, self._issued, self._until = False, 0, 0.0
         self._commands_before = self._answers_before = 0
-        self._asked = self._asks_pictures = False  # whether the holder waits for an answer
+        self._asked = self._asks_images = False  # whether the holder waits for an answer
 
     def hold(self, client: ClientConnection) -> dict[str, Any]:
         """Give the time to a client until it leaves; UserError if another holds it."""
         if self.held:
             raise UserError("another program holds the time of this twin")
-        self._holder, self._left, self._asked, self._asks_pictures = client, 0, False, False
+        self._holder, self._left, self._asked, self._asks_images = client, 0, False, False
         self._commands_before, self._answers_before = self._hand.commands, self._hand.answers
-        self._pictures.held = True
+        self._images.held = True
         return self._report()
 
     def advance(self, client: ClientConnection, steps: int, driven: bool, issued: int) -> None:
@@ -59,16 +59,16 @@ class LockStep:
         self._left, self._asked, self._until = steps, True, time.monotonic() + _PATIENCE
         self._driven, self._issued = driven, issued
 
-    def count_pictures(self, client: ClientConnection) -> None:
-        """Tell the holder how many pictures were sent, once all due ones are."""
+    def count_images(self, client: ClientConnection) -> None:
+        """Tell the holder how many images were sent, once all due ones are."""
         self._check_holder(client)
-        self._asks_pictures = True
+        self._asks_images = True
 
     @property
     def held(self) -> bool:
         """Whether a client holds the time."""
-        self._pictures.held = self._holder is not None and self._holder.open
-        return self._pictures.held
+        self._images.held = self._holder is not None and self._holder.open
+        return self._images.held
 
     @property
     def standing(self) -> bool:
@@ -80,9 +80,9 @@ class LockStep:
         if self._asked and not self._left and (self._arm.answered or self._impatient):
             self._asked = False
             self._answer(self._report())
-        if self._asks_pictures and self._pictures.all_sent:
-            self._asks_pictures = False
-            self._answer(self._pictures.sent)
+        if self._asks_images and self._images.all_sent:
+            self._asks_images = False
+            self._answer(self._images.sent)
         return True
 
     def count_step(self) -> None:
@@ -92,7 +92,7 @@ class LockStep:
     def wait(self, sockets: Sequence[Any]) -> None:
         """Wait briefly for a message of the arm's or hand's client, or on these sockets."""
         links = [*self._arm.link.sockets, *self._hand.link.sockets]
-        drawn = [self._pictures] if self._asks_pictures else []
+        drawn = [self._images] if self._asks_images else []
         select.select([*links, *sockets, *drawn], [], [], _POLL_INTERVAL)
 
     def _check_holder(self, client: ClientConnection) -> None:

@@ -14,7 +14,7 @@ _JPEG_HEADER = 640  # bytes of OpenCV's
 _SENDING_TIMEOUT = 2.0  # s
 _POLL_INTERVAL = 0.2  # s between looks at whether the stream is to end
 
-Picture = UInt8[np.ndarray, "h w 3"]
+Image = UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(eq=False)
@@ -28,11 +28,11 @@ class Stream:
     lost: float = 0.0
     broken: float = 0.0
     halved: float = 0.0
-    # clients, count, sent: number of viewers; pictures published; pictures sent to the last viewer
+    # clients, count, sent: number of viewers; images published; images sent to the last viewer
     clients: int = 0
     count: int = 0
     sent: int = 0
-    picture: Picture | None = None
+    image: Image | None = None
     condition: threading.Condition = field(default_factory=threading.Condition)
 
     @property
@@ -40,11 +40,11 @@ class Stream:
         """Whether a client would get an image."""
         return self.clients > 0 and time.monotonic() >= self.stalled
 
-    def publish(self, picture: Picture) -> None:
+    def publish(self, image: Image) -> None:
         """Publish an image to all clients."""
         with self.condition:
-            if time.monotonic() >= self.frozen or self.picture is None:
-                self.picture = picture
+            if time.monotonic() >= self.frozen or self.image is None:
+                self.image = image
             self.count += 1
             self.condition.notify_all()
 
@@ -116,10 +116,10 @@ class _Handler(BaseHTTPRequestHandler):
             with stream.condition:
                 if stream.count == last and not stream.condition.wait(_POLL_INTERVAL):
                     continue
-                last, picture = stream.count, stream.picture
-            assert picture is not None
+                last, image = stream.count, stream.image
+            assert image is not None
             now = time.monotonic()
-            bgr = np.ascontiguousarray(picture[..., ::-1])
+            bgr = np.ascontiguousarray(image[..., ::-1])
             _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
             if now < stream.halved:
                 jpeg = jpeg[: len(jpeg) // 2]

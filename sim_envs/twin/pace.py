@@ -15,15 +15,15 @@ class Pace:
         self._began: np.ndarray | None = None
         self._steps = 0
 
-    def count_step(self, driven: bool, pictures: float) -> None:
-        """Count a millisecond; `pictures`: processor s that their process has taken so far."""
+    def count_step(self, driven: bool, images: float) -> None:
+        """Count a millisecond; `images`: processor s that their process has taken so far."""
         if not driven:
             self._began = None
             return
         self._steps += 1
         if self._began is not None and self._steps < _BLOCK:
             return
-        now = np.array([time.monotonic(), time.process_time(), pictures])
+        now = np.array([time.monotonic(), time.process_time(), images])
         if self._began is not None:
             self._seconds.append((now - self._began) / (1e-3 * _BLOCK))
         self._began, self._steps = now, 0
@@ -32,11 +32,11 @@ class Pace:
         """Return figures of the counted seconds."""
         if not self._seconds:
             return {"seconds": 0}
-        wall, twin, pictures = np.transpose(self._seconds)
+        wall, twin, images = np.transpose(self._seconds)
         return {
             "seconds": len(self._seconds),
             "pace_median": float(np.median(1 / wall)),
             "pace_slowest": float(1 / wall.max()),
             "processor_twin": float(np.median(twin)),
-            "processor_pictures": float(np.median(pictures)),
+            "processor_pictures": float(np.median(images)),
         }

@@ -27,9 +27,9 @@ from touchgoal.sim_envs.tasks import make_env
 from touchgoal.sim_envs.twin.control_port import ControlPort
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand
+from touchgoal.sim_envs.twin.images import CAMERA_RATE, Images
 from touchgoal.sim_envs.twin.lock_step import LockStep
 from touchgoal.sim_envs.twin.pace import Pace
-from touchgoal.sim_envs.twin.pictures import CAMERA_RATE, Pictures
 from touchgoal.sim_envs.twin.serial import devices as serial_ports
 from touchgoal.sim_envs.twin.tcp_ports import Service
 from touchgoal.sim_envs.twin.ur.controller import UrController
@@ -101,7 +101,7 @@ class Twin:
         self.cell.step()
         for service in self._services:
             service.send()
-        self.pace.count_step(self._arm.driven, self.pictures.processor_time)
+        self.pace.count_step(self._arm.driven, self.images.processor_time)
         if lock_step is not None and lock_step.held:
             lock_step.count_step()
         else:
@@ -145,28 +145,28 @@ class Twin:
                 widths=(tool.stroke[1], tool.stroke[0]),
                 force=max(force, tool.force[0]),
             )
-        self.pictures = pictures = Pictures(cell, host, config.port)
-        services.append(pictures)
+        self.images = images = Images(cell, host, config.port)
+        services.append(images)
         control = config.port + 1 if config.port else 0
 
         def reset() -> None:
-            pictures.reset()
+            images.reset()
             load_cell.reset()
             if hand is not None:
                 hand.reset()
 
         if config.lock_step and hand is not None and isinstance(arm, FrankaArm):
-            self._lock_step = LockStep(cell, arm, hand, pictures, load_cell)
+            self._lock_step = LockStep(cell, arm, hand, images, load_cell)
         self._arm = arm
         self._commands = ControlPort(
-            cell, arm, pictures, ports, host, control, self._lock_step, reset
+            cell, arm, images, ports, host, control, self._lock_step, reset
         )
         services.append(self._commands)
         return self._describe(config, gripper, str(load_cell.port.path))
 
     def _describe(self, config: TwinConfig, gripper: GripperSection, load_cell: str) -> CellConfig:
         """Return the cell file; the link of a lock-step twin may be silent for longer."""
-        env, streams = self.cell.env, self.pictures.addresses()
+        env, streams = self.cell.env, self.images.addresses()
         cameras: dict[CameraName, CameraSection] = {
             name: CameraSection(streams[name], CAMERA_RATE)
             for name in get_args(CameraName)

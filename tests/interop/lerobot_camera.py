@@ -41,14 +41,14 @@ def play(stream: Stream) -> None:
 
 
 def refusal(read: Callable[[], np.ndarray]) -> str:
-    """Return why a picture is refused, once it is."""
+    """Return why an image is refused, once it is."""
     end = time.monotonic() + 60
     while time.monotonic() < end:
         try:
             read()
         except TimeoutError as error:
             return str(error)
-    raise AssertionError("every picture was taken")
+    raise AssertionError("every image was taken")
 
 
 def main() -> None:
@@ -62,19 +62,19 @@ def main() -> None:
     config = draccus.parse(SO101FollowerConfig, args=arguments)
     (camera,) = make_cameras_from_configs(config.cameras).values()
     with camera:
-        pictures = [camera.async_read(5000) for _ in range(5)] + [camera.read(), camera.read()]
-        for before, after in zip(pictures, pictures[1:], strict=False):
+        images = [camera.async_read(5000) for _ in range(5)] + [camera.read(), camera.read()]
+        for before, after in zip(images, images[1:], strict=False):
             assert (before != after).any()
         assert camera.read_latest().shape == (camera.height, camera.width, 3) == (240, 320, 3)
         stream.frozen = np.inf
         frozen = refusal(camera.read_latest)
-        assert refusal(camera.async_read) == frozen or "one picture" in frozen
+        assert refusal(camera.async_read) == frozen or "one image" in frozen
         stream.frozen = 0.0
         camera.read()
         stream.stalled = np.inf
         stalled = refusal(camera.read_latest)
     server.close()
-    print(f"{len(pictures)} pictures read at {camera.fps} Hz; refused: {frozen}; {stalled}")
+    print(f"{len(images)} images read at {camera.fps} Hz; refused: {frozen}; {stalled}")
 
 
 if __name__ == "__main__":

@@ -18,10 +18,10 @@ FPS = 15
 
 
 def features(video: bool) -> dict:
-    picture = {"shape": (96, 128, 3), "names": ["height", "width", "channels"]}
+    image = {"shape": (96, 128, 3), "names": ["height", "width", "channels"]}
     numbers = {"dtype": "float32", "shape": (6,), "names": [f"{name}.pos" for name in ARM]}
     return {
-        "observation.images.top": {"dtype": "video" if video else "image", **picture},
+        "observation.images.top": {"dtype": "video" if video else "image", **image},
         "observation.state": numbers,
         "action": numbers,
         "next.done": {"dtype": "bool", "shape": (1,), "names": None},
@@ -36,11 +36,11 @@ def add_episode(dataset: LeRobotDataset, seed: int) -> None:
     for t in range(n):
         x, y = x + rng.normal(), y + rng.normal()
         bright = 200 * np.exp(-((rows - y) ** 2 + (columns - x) ** 2) / 200)
-        picture = np.stack([bright, columns, np.full((96, 128), 10 * seed)], -1).astype(np.uint8)
+        image = np.stack([bright, columns, np.full((96, 128), 10 * seed)], -1).astype(np.uint8)
         state = rng.normal(size=6).astype(np.float32)
         dataset.add_frame(
             {
-                "observation.images.top": picture,
+                "observation.images.top": image,
                 "observation.state": state,
                 "action": state + 0.1,
                 "next.done": np.array([t == n - 1]),

@@ -20,7 +20,7 @@ from benchmarks.papers.mmwand.fine_tuned import (
     Modality,
     Network,
     fine_tune,
-    read_pictures,
+    read_images,
 )
 from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from benchmarks.papers.mmwand.splits import Fold
@@ -71,8 +71,8 @@ class Config(BenchmarkOptions):
     """Inputs of the fine-tuned networks."""
     epochs: Count = 12
     """Passes of the fine-tuning over the touches."""
-    picture_rows: Count = 112
-    """Rows of their pictures, px."""
+    image_rows: Count = 112
+    """Rows of their images, px."""
     device: str = "cpu"
     """Device of all trainings, as torch names it: cpu, cuda."""
     cache: Path = Path("runs/mmwand-embeddings")
@@ -122,12 +122,12 @@ def _fine_tuned(config: Config, data: EmbeddedSet) -> list[dict[str, Any]]:
     if not config.fine_tuned:
         return []
     check_device(config.device)
-    pictures, rows = read_pictures(WandSet.open(config.data), config.picture_rows), []
+    images, rows = read_images(WandSet.open(config.data), config.image_rows), []
     for split in config.splits:
         fold = data.fold(split, config.seed)
         for network in config.fine_tuned:
             for modality in config.modalities:
-                inputs = list(pictures.values()) if modality == "both" else [pictures[modality]]
+                inputs = list(images.values()) if modality == "both" else [images[modality]]
                 rest = data.label, fold, config.epochs, config.seed, config.device
                 right = fine_tune(network, inputs, *rest)
                 found = mean_over_objects(data.label[fold.test], right)

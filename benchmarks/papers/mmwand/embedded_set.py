@@ -12,14 +12,14 @@ from jaxtyping import Bool, Float32, Int
 
 from benchmarks.papers.mmwand.splits import Fold, Split, split_touches
 from benchmarks.real_touch.embedders import Embedder, find_embedder
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.ssl.frames import find_sensor_name
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.progress import track
 
-_SMALL = (40, 30)  # px of the pictures that pixels are compared in
+_SMALL = (40, 30)  # px of the images that pixels are compared in
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class EmbeddedSet:
 
 
 def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> EmbeddedSet:
-    """Embed the pictures, views and sentences of a set that `collect-touches` recorded.
+    """Embed the images, views and sentences of a set that `collect-touches` recorded.
 
     UserError: no such set or encoder, or touches without views.
 
@@ -72,11 +72,11 @@ def _embed_touches(
     name: str, seed: int, data: WandSet, keep: Callable[[str, Callable[[], np.ndarray]], np.ndarray]
 ) -> Float32[np.ndarray, "n d"]:
     embed = find_embedder(name, seed)
-    what = touch_key(embed, *data.pictures(0))
+    what = touch_key(embed, *data.images(0))
     return keep(what, lambda: data.embed_touches(embed))
 
 
-def touch_key(embed: Embedder, untouched: Picture, touched: Picture) -> str:
+def touch_key(embed: Embedder, untouched: Image, touched: Image) -> str:
     """Return a key of touch embeddings, of the first one's: an encoder's name may get new weights."""
     return f"touch {hashlib.sha256(embed(touched[None], untouched).tobytes()).hexdigest()}"
 
@@ -93,7 +93,7 @@ def cached(cache: Path, data: str, what: str, make: Callable[[], np.ndarray]) ->
     return array
 
 
-def small_change(untouched: Picture, touched: Picture) -> Float32[np.ndarray, " p"]:
+def small_change(untouched: Image, touched: Image) -> Float32[np.ndarray, " p"]:
     """Return the raw pixels of a touch: its change, 40 x 30 px with its sign."""
     change = touched.astype(np.float32) - untouched
     return cv2.resize(change, _SMALL, interpolation=cv2.INTER_AREA).ravel()
@@ -101,4 +101,4 @@ def small_change(untouched: Picture, touched: Picture) -> Float32[np.ndarray, " 
 
 def _pixels(data: WandSet) -> Float32[np.ndarray, "n d"]:
     reading = track(range(len(data)), "reading pixels", "touch")
-    return np.stack([small_change(*data.pictures(i)) for i in reading])
+    return np.stack([small_change(*data.images(i)) for i in reading])

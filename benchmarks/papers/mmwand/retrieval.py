@@ -1,7 +1,7 @@
 """Cross-modal retrieval on wand touches: MMWand's Table IV, on four splits.
 
 Every query ranks all candidates of the other modality by cosine; candidates of the same object are
-right. A touch and the picture taken with it are never matched. For every encoder, linear heads
+right. A touch and the image taken with it are never matched. For every encoder, linear heads
 fitted on the training touches map images and sentences to its frozen embeddings; `--trained` adds
 touch backbones that are trained on the same touches, as in the paper.
 """
@@ -170,7 +170,7 @@ def judge(data: EmbeddedSet, fold: Fold, embedded: dict[str, Float[np.ndarray, "
     """Judge all directions between modalities; queries without a right candidate are skipped.
 
     Args:
-        embedded: unit vectors of one space: of the test touches, their pictures, the test sentences;
+        embedded: unit vectors of one space: of the test touches, their images, the test sentences;
             two of them or all three.
     """
     label = data.label[fold.test]
@@ -201,7 +201,7 @@ def judge(data: EmbeddedSet, fold: Fold, embedded: dict[str, Float[np.ndarray, "
 
 
 def _nearest_in_pixels(data: EmbeddedSet, fold: Fold, seed: int) -> Found:
-    """Represent a touch by the picture and sentences of the nearest training touch in raw pixels."""
+    """Represent a touch by the image and sentences of the nearest training touch in raw pixels."""
     pixels, image, texts = (_unit(a) for a in (data.pixels, data.image.mean(1), data.texts))
     nearest = fold.train[(pixels[fold.test] @ pixels[fold.train].T).argmax(1)]
     own = data.describes[data.label[nearest]] & fold.train_text

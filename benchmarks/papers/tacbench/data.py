@@ -149,10 +149,10 @@ def _field(rig: RigConfig, index: int) -> Float32[np.ndarray, "t 3 24 24"]:
 
 
 def preprocessed(
-    pictures: UInt8[np.ndarray, "t h w 3"], preprocess: Preprocessor
+    images: UInt8[np.ndarray, "t h w 3"], preprocess: Preprocessor
 ) -> Float16[Tensor, "t 3 H W"]:
-    """Preprocess pictures; their background is the first one."""
-    return torch.from_numpy(preprocess(pictures, pictures[0])).half()
+    """Preprocess images; their background is the first one."""
+    return torch.from_numpy(preprocess(images, images[0])).half()
 
 
 def rows_before(lengths: list[int], stride: int) -> Rows:

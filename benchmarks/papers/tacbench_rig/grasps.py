@@ -37,7 +37,7 @@ _LOWEST = 0.018  # m: lowest height of the pads' middle above the table
 class GraspAttempt:
     """One attempt to grip and lift an object."""
 
-    # left, right: the fingertips' pictures at `MOMENTS`, RGB
+    # left, right: the fingertips' images at `MOMENTS`, RGB
     left: UInt8[np.ndarray, "3 h w 3"]
     right: UInt8[np.ndarray, "3 h w 3"]
     # force (N) and torque (Nm) of the object on the left, then the right pad, at `MOMENTS`

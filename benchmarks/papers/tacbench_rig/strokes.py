@@ -21,7 +21,7 @@ from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 
 FRICTION_SPREAD = 0.15  # largest relative deviation of a stroke's friction from `FRICTION`
 MAX_SLIDE = 2e-3  # m
-_PLACES = 3e-3  # m from the middle of the picture, along x and y
+_PLACES = 3e-3  # m from the middle of the image, along x and y
 _PRESS_FRAMES = 8, 16
 _SLIDE_FRAMES = 12, 25
 _SLIDES = 0.5, 3.0  # slide as a multiple of the distance that friction holds

@@ -1,4 +1,4 @@
-"""Dots printed on a gel: detection, tracking, and removal from a picture."""
+"""Dots printed on a gel: detection, tracking, and removal from an image."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int
 
-from touchgoal.control.arrays import AnyPicture, Picture
+from touchgoal.control.arrays import AnyImage, Image
 from touchgoal.control.tactile.markers.matching import Dots, Flags, Spots, average_neighbours, match
 from touchgoal.control.tactile.sensor_models import MarkerGrid
 from touchgoal.runtime.errors import UserError
@@ -47,7 +47,7 @@ class MarkerTracker:
     UserError if the untouched frame does not show it.
     """
 
-    def __init__(self, untouched: Picture, grid: MarkerGrid, pixel_pitch: float) -> None:
+    def __init__(self, untouched: Image, grid: MarkerGrid, pixel_pitch: float) -> None:
         self._size = grid.diameter / pixel_pitch
         self.rest = self.now = find_markers(untouched, grid, pixel_pitch)
         _, darkness = _spots(_grey(untouched), self._size)
@@ -61,7 +61,7 @@ class MarkerTracker:
         """Displacement of each dot from its rest, px."""
         return self.now.positions - self.rest.positions
 
-    def update(self, frame: Picture) -> Markers:
+    def update(self, frame: Image) -> Markers:
         """Find the dots in the next frame."""
         before = self.now.positions
         grey = _grey(frame)
@@ -82,7 +82,7 @@ class MarkerTracker:
         return self.now
 
 
-def find_markers(image: Picture, grid: MarkerGrid, pixel_pitch: float) -> Markers:
+def find_markers(image: Image, grid: MarkerGrid, pixel_pitch: float) -> Markers:
     """Find the dots of an untouched gel, by rows (downwards) and columns (rightwards).
 
     The grid may be rotated by up to 30 degrees, shifted, and scaled by a fifth; `pixel_pitch` is m
@@ -114,8 +114,8 @@ def find_markers(image: Picture, grid: MarkerGrid, pixel_pitch: float) -> Marker
 
 
 def without_markers(
-    image: AnyPicture, centres: Float32[np.ndarray, "*n 2"], radius: float
-) -> AnyPicture:
+    image: AnyImage, centres: Float32[np.ndarray, "*n 2"], radius: float
+) -> AnyImage:
     """Paint dots of a radius (px), and a rim of 2 px, over with a membrane between their rims.
 
     `centres` are (x, y) in px, such as `Markers.positions`.
@@ -129,7 +129,7 @@ def without_markers(
     return padded[margin : margin + h, margin : margin + w]
 
 
-def _grey(image: Picture) -> Grey:
+def _grey(image: Image) -> Grey:
     return cv2.transform(image.astype(np.float32), np.full((1, 3), 1 / 3, np.float32))[..., None]
 
 

@@ -18,7 +18,7 @@ from benchmarks.papers.mmwand.embedded_set import (
 )
 from benchmarks.published_touch.tvl import CaptionedTouch, read_tvl
 from benchmarks.real_touch.embedders import Embedder, find_embedder
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.episodes.importers.touch_clip import decode
 from touchgoal.runtime.progress import track
@@ -37,7 +37,7 @@ def embed_captioned(root: Path, encoders: tuple[str, ...], seed: int, cache: Pat
     made = {}
     for name in encoders:
         embed = find_embedder(name, seed)
-        what = touch_key(embed, *_pictures(touches[0], untouched))
+        what = touch_key(embed, *_images(touches[0], untouched))
         made[name] = keep(what, lambda embed=embed: _embed(touches, untouched, embed))
     return EmbeddedSet(
         names=tuple(names.tolist()),
@@ -53,43 +53,43 @@ def embed_captioned(root: Path, encoders: tuple[str, ...], seed: int, cache: Pat
     )
 
 
-def _median(touches: list[CaptionedTouch]) -> Picture:
-    """Return the median picture of touches of SSVTP, which has no untouched one, or of any others."""
+def _median(touches: list[CaptionedTouch]) -> Image:
+    """Return the median image of touches of SSVTP, which has no untouched one, or of any others."""
     own = [touch for touch in touches if touch.untouched is None] or touches
     some = own[:: max(1, len(own) // _MEDIAN_OF)]
-    pictures = np.stack([_picture(touch.touch) for touch in some])
-    return np.median(pictures, axis=0).astype(np.uint8)
+    images = np.stack([_image(touch.touch) for touch in some])
+    return np.median(images, axis=0).astype(np.uint8)
 
 
-def _pictures(touch: CaptionedTouch, untouched: Picture) -> tuple[Picture, Picture]:
-    """Return the untouched and the touched picture, RGB."""
-    own = _picture(touch.untouched) if touch.untouched else untouched
-    return own, _picture(touch.touch)
+def _images(touch: CaptionedTouch, untouched: Image) -> tuple[Image, Image]:
+    """Return the untouched and the touched image, RGB."""
+    own = _image(touch.untouched) if touch.untouched else untouched
+    return own, _image(touch.touch)
 
 
-def _picture(path: Path) -> Picture:
+def _image(path: Path) -> Image:
     return decode(path.read_bytes(), str(path))
 
 
 def _embed(
-    touches: list[CaptionedTouch], untouched: Picture, embed: Embedder
+    touches: list[CaptionedTouch], untouched: Image, embed: Embedder
 ) -> Float32[np.ndarray, "n d"]:
     rows = []
     for touch in track(touches, "embedding touches", "touch"):
-        own, touched = _pictures(touch, untouched)
+        own, touched = _images(touch, untouched)
         rows.append(embed(touched[None], own)[0])
     return np.stack(rows).astype(np.float32)
 
 
-def _pixels(touches: list[CaptionedTouch], untouched: Picture) -> Float32[np.ndarray, "n d"]:
+def _pixels(touches: list[CaptionedTouch], untouched: Image) -> Float32[np.ndarray, "n d"]:
     reading = track(touches, "reading pixels", "touch")
-    return np.stack([small_change(*_pictures(touch, untouched)) for touch in reading])
+    return np.stack([small_change(*_images(touch, untouched)) for touch in reading])
 
 
 def _embed_views(touches: list[CaptionedTouch], towers: Towers) -> Float32[np.ndarray, "n 1 i"]:
     return np.stack(
         [
-            towers.embed_images(_picture(touch.picture)[None]).numpy()
+            towers.embed_images(_image(touch.image)[None]).numpy()
             for touch in track(touches, "embedding views", "view")
         ]
     )

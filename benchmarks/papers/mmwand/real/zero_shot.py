@@ -3,7 +3,7 @@
 With --other: the same table on touches of the wand, see `other_set`. On episodes in which objects are
 grasped: the objects in place of materials, see `grasped_objects`.
 
-A touch gets the material whose sentences are nearest on average. The gel's untouched picture is
+A touch gets the material whose sentences are nearest on average. The gel's untouched image is
 the median of all touches, because none is published.
 """
 

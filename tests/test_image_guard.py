@@ -1,4 +1,4 @@
-"""Pictures that are not their sensor's are refused by a line that names the fault; whole ones pass."""
+"""Images that are not their sensor's are refused by a line that names the fault; whole ones pass."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +15,7 @@ from touchgoal.control.calibration.ball import press_surface
 from touchgoal.control.features import TACTILE
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.sensors.tactile_camera import NO_CROP, TactileCamera
-from touchgoal.control.tactile.picture_guard import (
+from touchgoal.control.tactile.image_guard import (
     check_presses,
     check_unpressed,
     check_untouched,
@@ -42,22 +42,22 @@ REAL = Path(__file__).parents[2] / "shared" / "data"  # beside the project; not 
 MINI = load(GELSIGHT_MINI.sensor_file)
 
 
-def stretched(picture: np.ndarray) -> np.ndarray:
+def stretched(image: np.ndarray) -> np.ndarray:
     """Stretch by 8 % along the rows and cut off the sides."""
-    height, width, _ = picture.shape
-    wide = cv2.resize(np.ascontiguousarray(picture), (round(1.08 * width), height))
+    height, width, _ = image.shape
+    wide = cv2.resize(np.ascontiguousarray(image), (round(1.08 * width), height))
     left = (wide.shape[1] - width) // 2
     return wide[:, left : left + width]
 
 
-def torn(picture: np.ndarray) -> np.ndarray:
-    middle = len(picture) // 2
-    return np.concatenate([picture[:middle], np.roll(picture[middle:], 40, 1)])
+def torn(image: np.ndarray) -> np.ndarray:
+    middle = len(image) // 2
+    return np.concatenate([image[:middle], np.roll(image[middle:], 40, 1)])
 
 
-def half_grey(picture: np.ndarray) -> np.ndarray:
-    middle = len(picture) // 2
-    return np.concatenate([picture[:middle], np.full_like(picture[middle:], 128)])
+def half_grey(image: np.ndarray) -> np.ndarray:
+    middle = len(image) // 2
+    return np.concatenate([image[:middle], np.full_like(image[middle:], 128)])
 
 
 Fault = Callable[[np.ndarray], np.ndarray]
@@ -74,8 +74,8 @@ FAULTS: dict[str, tuple[Fault, str]] = {
 }
 
 
-def other_light(picture: np.ndarray) -> np.ndarray:
-    return (picture * np.array([0.85, 1.0, 1.15])).clip(0, 255).astype(np.uint8)
+def other_light(image: np.ndarray) -> np.ndarray:
+    return (image * np.array([0.85, 1.0, 1.15])).clip(0, 255).astype(np.uint8)
 
 
 @pytest.mark.parametrize("model", [GELSIGHT_MINI, DIGIT], ids=lambda model: model.name)
@@ -83,10 +83,10 @@ def other_light(picture: np.ndarray) -> np.ndarray:
 def test_every_fault_is_named(fault: str, model: SensorModel) -> None:
     change, says = FAULTS[fault]
     rng = np.random.default_rng(0)
-    picture = load(model.sensor_file).background + rng.normal(size=(*model.image_shape, 3))
-    picture = np.ascontiguousarray(change(other_light(picture)))
+    image = load(model.sensor_file).background + rng.normal(size=(*model.image_shape, 3))
+    image = np.ascontiguousarray(change(other_light(image)))
     with pytest.raises(UserError) as refused:
-        check_untouched(picture, model, "the picture")
+        check_untouched(image, model, "the image")
     assert says in str(refused.value)
 
 
@@ -95,11 +95,11 @@ def test_other_sensors_of_the_model_pass() -> None:
     rng = np.random.default_rng(0)
     for model in (GELSIGHT_MINI, GELSIGHT_MINI_MARKERS, DIGIT):
         for _ in range(8):
-            picture = other_light(render_untouched(sample_instance(model, rng), rng))
+            image = other_light(render_untouched(sample_instance(model, rng), rng))
             for x, y in rng.integers(20, 220, (6, 2)):
-                cv2.circle(picture, (int(x), int(y)), 3, (30, 25, 30), -1)
-            check_untouched(picture, model, "the picture")
-            check_unpressed(picture, model, "the picture")
+                cv2.circle(image, (int(x), int(y)), 3, (30, 25, 30), -1)
+            check_untouched(image, model, "the image")
+            check_unpressed(image, model, "the image")
 
 
 def balls(model: SensorModel) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -111,8 +111,8 @@ def balls(model: SensorModel) -> tuple[np.ndarray, list[np.ndarray]]:
         for x in (0.3, 0.7)
         for y in (0.3, 0.7)
     ]
-    pictures = [shade(calibration, surface) for surface in surfaces]
-    noisy = [(p + rng.normal(size=p.shape)).round().clip(0, 255).astype(np.uint8) for p in pictures]
+    images = [shade(calibration, surface) for surface in surfaces]
+    noisy = [(p + rng.normal(size=p.shape)).round().clip(0, 255).astype(np.uint8) for p in images]
     return noisy[0], noisy[1:]
 
 
@@ -123,7 +123,7 @@ def test_presses_tell_a_mirror_that_the_untouched_gel_does_not_show(tmp_path: Pa
     untouched, presses = balls(model)
     check_presses(untouched, presses, model, "the presses")
     untouched, presses = untouched[:, ::-1].copy(), [p[:, ::-1].copy() for p in presses]
-    check_untouched(untouched, model, "the picture")
+    check_untouched(untouched, model, "the image")
     with pytest.raises(UserError, match="mirrored left to right"):
         check_presses(untouched, presses, model, "the presses")
 
@@ -135,14 +135,14 @@ def test_a_pressed_edge_is_no_tear() -> None:
     for y in np.arange(-0.0215, -0.0155, 0.0008):  # m; an edge lies across the pad, along its rows
         bench = PressBench(block, GELSIGHT_MINI, gel)
         bench.place(np.array([0.0, y, 0.03]), None)
-        picture = bench.sense(40.0, np.random.default_rng(1), centre=(0.0, 0.0)).image
-        stepped += bool(find_seam(picture))
-        assert not find_seam(picture, untouched)
+        image = bench.sense(40.0, np.random.default_rng(1), centre=(0.0, 0.0)).image
+        stepped += bool(find_seam(image))
+        assert not find_seam(image, untouched)
     assert stepped
     assert "row" in find_seam(torn(untouched), untouched)
 
 
-def test_a_fingertip_leaves_out_torn_pictures() -> None:
+def test_a_fingertip_leaves_out_torn_images() -> None:
     clock = FakeClock()
     camera = FakeCamera(clock, MINI.background)
     fingertip = TactileCamera(camera, GELSIGHT_MINI, NO_CROP)
@@ -159,10 +159,10 @@ def test_a_fingertip_leaves_out_torn_pictures() -> None:
 
 def test_commands_and_curves_refuse_exchanged_colours(tmp_path: Path) -> None:
     untouched, presses = balls(GELSIGHT_MINI)
-    swapped = [picture[..., ::-1] for picture in (*[untouched] * 3, *presses * 4)]
+    swapped = [image[..., ::-1] for image in (*[untouched] * 3, *presses * 4)]
     cv2.imwrite(str(tmp_path / "background.png"), swapped[0][..., ::-1])
-    for i, picture in enumerate(swapped[3:]):
-        cv2.imwrite(str(tmp_path / f"{i:02d}.png"), picture[..., ::-1])
+    for i, image in enumerate(swapped[3:]):
+        cv2.imwrite(str(tmp_path / f"{i:02d}.png"), image[..., ::-1])
     options = ["--out", str(tmp_path / "out")]
     commands = [
         ["check-sensor", str(tmp_path), *options],
@@ -195,16 +195,16 @@ def test_a_set_in_which_the_fingertips_change_places_is_refused(tmp_path: Path) 
 @pytest.mark.parametrize(("folder", "model"), [("mini", GELSIGHT_MINI), ("digit", DIGIT)])
 def test_real_presses_pass_and_their_faults_do_not(folder: str, model: SensorModel) -> None:
     files = sorted((REAL / f"{folder}_presses").glob("*.png"))
-    pictures = {file.name: cv2.imread(str(file))[..., ::-1].copy() for file in files}  # pyright: ignore
-    untouched = pictures.pop("background.png")
-    for picture in (untouched, *pictures.values()):
-        check_untouched(picture, model, "the picture")
+    images = {file.name: cv2.imread(str(file))[..., ::-1].copy() for file in files}  # pyright: ignore
+    untouched = images.pop("background.png")
+    for image in (untouched, *images.values()):
+        check_untouched(image, model, "the image")
     for change, says in FAULTS.values():
         with pytest.raises(UserError, match=says):
-            check_untouched(np.ascontiguousarray(change(untouched)), model, "the picture")
-    presses = list(pictures.values())[::4]
-    check_unpressed(untouched, model, "the picture")
+            check_untouched(np.ascontiguousarray(change(untouched)), model, "the image")
+    presses = list(images.values())[::4]
+    check_unpressed(untouched, model, "the image")
     for press in presses:
         with pytest.raises(UserError, match="begins in touch"):
-            check_unpressed(press, model, "the picture")
+            check_unpressed(press, model, "the image")
     check_presses(untouched, presses, model, "the presses")

@@ -1,4 +1,4 @@
-"""Contact force on a fingertip from the change of its picture, without gel model or sensor file."""
+"""Contact force on a fingertip from the change of its image, without gel model or sensor file."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from touchgoal.control.arrays import Counts, Picture
+from touchgoal.control.arrays import Counts, Image
 from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.runtime.errors import UserError
@@ -20,7 +20,7 @@ _MIN_FRAMES = 50
 
 
 @dataclass(frozen=True, eq=False)
-class PictureForce:
+class ImageForce:
     """Ridge regression from `change_statistics` to force (N), without gel model or sensor file.
 
     `mean` and `spread` are of the statistics in the calibration grasps; `weights` are N per spread.
@@ -36,7 +36,7 @@ class PictureForce:
         return np.maximum((rows - self.mean) / self.spread @ self.weights + self.offset, 0)
 
 
-def calibrate_force(rows: Float[np.ndarray, "n k"], force: Float[np.ndarray, " n"]) -> PictureForce:
+def calibrate_force(rows: Float[np.ndarray, "n k"], force: Float[np.ndarray, " n"]) -> ImageForce:
     """Fit forces (N) to `change_statistics` of grasps on a load cell, untouched frames included.
 
     The objects should be similar to those to come. UserError if there are too few frames, or no
@@ -50,20 +50,20 @@ def calibrate_force(rows: Float[np.ndarray, "n k"], force: Float[np.ndarray, " n
     mean, spread = rows.mean(0), rows.std(0) + 1e-6
     known, offset = (rows - mean) / spread, float(force.mean())
     square = known.T @ known + RIDGE_STRENGTH * np.eye(known.shape[1])
-    return PictureForce(mean, spread, np.linalg.solve(square, known.T @ (force - offset)), offset)
+    return ImageForce(mean, spread, np.linalg.solve(square, known.T @ (force - offset)), offset)
 
 
-def resized(picture: np.ndarray) -> Counts:
-    """Return a picture scaled to 320 pixels of width."""
-    h, w, _ = picture.shape
+def resized(image: np.ndarray) -> Counts:
+    """Return an image scaled to 320 pixels of width."""
+    h, w, _ = image.shape
     size = _WIDTH, round(h * _WIDTH / w)
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def change_statistics(
-    frame: Picture, background: Float32[np.ndarray, "h2 w2 3"]
+    frame: Image, background: Float32[np.ndarray, "h2 w2 3"]
 ) -> Float[np.ndarray, " k"]:
-    """Return strength and extent of the change from the untouched picture (`resized`).
+    """Return strength and extent of the change from the untouched image (`resized`).
 
     Each statistic appears as it is, as its root and as its logarithm.
     """

@@ -1,4 +1,4 @@
-"""Pictures that carry a number, and waiting until something holds."""
+"""Images that carry a number, and waiting until something holds."""
 
 import time
 from collections.abc import Callable
@@ -9,7 +9,7 @@ BITS = 12
 
 
 def numbered(k: int, shape: tuple[int, int] = (96, 128)) -> np.ndarray:
-    """A reddish RGB picture that carries `k` in black and white stripes."""
+    """A reddish RGB image that carries `k` in black and white stripes."""
     image = np.full((*shape, 3), (180, 60, 20), np.uint8)
     for bit in range(BITS):
         image[:32, bit * 10 : bit * 10 + 10] = 255 * (k >> bit & 1)

@@ -1,19 +1,19 @@
-"""A live picture in any browser, for machines with and without a screen."""
+"""A live image in any browser, for machines with and without a screen."""
 
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 from touchgoal.runtime.errors import UserError
 
 _BOUNDARY = b"picture"
-_PATIENCE = 1.0  # s without a new picture after which the last one is sent again
+_PATIENCE = 1.0  # s without a new image after which the last one is sent again
 
 
-class LivePicture:
-    """MJPEG server of the latest picture at http://127.0.0.1:port/; port 0 is any free one.
+class LiveImage:
+    """MJPEG server of the latest image at http://127.0.0.1:port/; port 0 is any free one.
 
     UserError if the port is taken.
     """
@@ -33,14 +33,14 @@ class LivePicture:
         """Address for a browser."""
         return f"http://127.0.0.1:{self._server.server_address[1]}/"
 
-    def show(self, picture: Picture) -> None:
-        """Replace the picture, RGB."""
+    def show(self, image: Image) -> None:
+        """Replace the image, RGB."""
         with self._changed:
-            self._jpeg = cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes()
+            self._jpeg = cv2.imencode(".jpg", image[..., ::-1])[1].tobytes()
             self._changed.notify_all()
 
     def next_jpeg(self) -> bytes | None:
-        """Wait for the next picture, or return the last one again; None when closed."""
+        """Wait for the next image, or return the last one again; None when closed."""
         with self._changed:
             self._changed.wait(_PATIENCE)
             return None if self._closed else self._jpeg
@@ -55,9 +55,9 @@ class LivePicture:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Stream of pictures to one browser."""
+    """Stream of images to one browser."""
 
-    live: LivePicture
+    live: LiveImage
 
     def do_GET(self) -> None:
         self.send_response(200)

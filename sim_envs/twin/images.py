@@ -11,23 +11,23 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
-from touchgoal.sim_envs.twin.picture_process import STATE, Fault, RenderRequest, Scene
+from touchgoal.sim_envs.twin.image_process import STATE, Fault, RenderRequest, Scene
 from touchgoal.sim_envs.twin.tcp_ports import Service
 
 CAMERA_RATE = 25  # Hz, as a fingertip's; more than a policy reads
 _START_TIMEOUT, _END_TIMEOUT = 120.0, 5.0  # s, on a loaded machine, too
 _MOST_BEHIND = 2  # unanswered requests in real time, beyond which images are left out
-_PROGRAM = "from touchgoal.sim_envs.twin.picture_process import main; main()"
+_PROGRAM = "from touchgoal.sim_envs.twin.image_process import main; main()"
 
 
-class Pictures(Service):
-    """Streams cameras and sensors of the cell at `http://host:port/NAME`, by `picture_process`."""
+class Images(Service):
+    """Streams cameras and sensors of the cell at `http://host:port/NAME`, by `image_process`."""
 
     def __init__(self, cell: SimulatedCell, host: str, port: int) -> None:
         """Start the process; raises OSError if it cannot serve there."""
         self._cell, self._host = cell, host
-        self.held = False  # whether a client holds the time, and waits for each picture
-        # taken, left_out: due pictures that were taken, or skipped because the process was behind
+        self.held = False  # whether a client holds the time, and waits for each image
+        # taken, left_out: due images that were taken, or skipped because the process was behind
         self.taken = self.left_out = 0
         env = cell.env
         self.rates: dict[str, int] = {}  # Hz, simulated, by stream, such as tactile_left
@@ -110,7 +110,7 @@ class Pictures(Service):
         if isinstance(answer, int):
             return answer
         self.close()
-        raise answer or UserError("the process for the twin's pictures did not start")
+        raise answer or UserError("the process for the twin's images did not start")
 
     def _tell(self, message: Scene | RenderRequest | Fault) -> None:
         try:

@@ -1,9 +1,9 @@
-"""Check that fingertip pictures are the sensor's: whole, in RGB order, the right way round.
+"""Check that fingertip images are the sensor's: whole, in RGB order, the right way round.
 
-The untouched picture is compared with the sensor file's under other channel orders, mirrors, scales
+The untouched image is compared with the sensor file's under other channel orders, mirrors, scales
 and shifts, ignoring each channel's gain. A hypothesis that fits clearly better is the fault. A step
-across half a row is the seam of a torn picture. Presses decide between hypotheses that fit equally:
-a Mini's untouched picture is nearly the same mirrored left to right, but then its sensor file
+across half a row is the seam of a torn image. Presses decide between hypotheses that fit equally:
+a Mini's untouched image is nearly the same mirrored left to right, but then its sensor file
 explains no press. Printed dots and dust do not count.
 """
 
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from touchgoal.control.arrays import Counts, Map, Picture
+from touchgoal.control.arrays import Counts, Image, Map
 from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.light_gain import remove_gain
@@ -23,10 +23,10 @@ from touchgoal.control.tactile.sensor_calibration import SensorCalibration, load
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
 
-# Thresholds lie between what whole pictures and faulty ones reach, on the real frames of three
+# Thresholds lie between what whole images and faulty ones reach, on the real frames of three
 # Minis and two DIGITs.
 _SEAM, _STEP = 3.5, 6.0  # times the usual step from row to row; counts, the channels' sum
-_EDGE = 10  # share of a picture (1/n) at either end where a seam may be the sensor's case
+_EDGE = 10  # share of an image (1/n) at either end where a seam may be the sensor's case
 # Counts, the channels' sum: in simulation the edge of a block pressed with 40 N changes a side by 17.
 _MOVED = 24.0
 _SEAM_PARTS = 32  # along a row, half of which must show the step
@@ -42,8 +42,8 @@ _PRESS_LEFT = (
 )
 _MAX_PRESSES = 6  # number of presses that are read
 _CELL = 8  # px of a cell in which changes are averaged; the finest of the depth that is read
-_STRONGEST = 0.1  # share of the picture over which the explanation is judged
-_COARSE = 4  # px of the sensor's picture to a cell of the comparison
+_STRONGEST = 0.1  # share of the image over which the explanation is judged
+_COARSE = 4  # px of the sensor's image to a cell of the comparison
 _DARK = 8.0  # counts added before the logarithm: noise in the dark is no difference
 _MOST = 0.5  # largest difference of log light that a cell counts with
 _COLOURS = "red", "green", "blue"
@@ -53,14 +53,14 @@ Cells = Float32[np.ndarray, "rows columns 3"]
 
 @dataclass(frozen=True)
 class _View:
-    """Hypothesis on a picture: its channels in another order, mirrored, or both."""
+    """Hypothesis on an image: its channels in another order, mirrored, or both."""
 
     order: tuple[int, ...]
     rows: bool  # mirrored top to bottom
     columns: bool  # mirrored left to right
 
     def undo(self, image: np.ndarray) -> np.ndarray:
-        """Return the picture with this hypothesis undone."""
+        """Return the image with this hypothesis undone."""
         image = image[..., list(self.order)]
         image = image[::-1] if self.rows else image
         return np.ascontiguousarray(image[:, ::-1] if self.columns else image)
@@ -89,14 +89,14 @@ _MOVES = [(x, y, 0, 0) for x, y in product((0.926, 1, 1.08), repeat=2) if (x, y)
 _MOVES += [(1, 1, x, y) for x, y in product((-6, -3, 0, 3, 6), repeat=2) if (x, y) != (0, 0)]
 
 
-def find_seam(picture: Picture, before: Picture | None = None) -> str:
+def find_seam(image: Image, before: Image | None = None) -> str:
     """Return where half a row or column steps away, as if torn or rolled; "" if it is whole.
 
-    A pressed edge steps as sharply, but hardly changes what lies beyond it: with the whole picture
+    A pressed edge steps as sharply, but hardly changes what lies beyond it: with the whole image
     `before` it, a step counts only where a side of it has changed altogether.
     """
     for axis, name in enumerate(("row", "column")):
-        lines = np.swapaxes(picture, 0, axis)
+        lines = np.swapaxes(image, 0, axis)
         count = lines.shape[0]
         margin = count // _EDGE
         if margin < 3:  # too small to check
@@ -113,8 +113,8 @@ def find_seam(picture: Picture, before: Picture | None = None) -> str:
     return ""
 
 
-def _side_changed(lines: Picture, before: Picture, at: int) -> bool:
-    """Return whether the lines before or after `at` differ from another picture's altogether."""
+def _side_changed(lines: Image, before: Image, at: int) -> bool:
+    """Return whether the lines before or after `at` differ from another image's altogether."""
     change = cv2.subtract(lines, before, dtype=cv2.CV_32F)
     size = lines.shape[1] // _CELL, lines.shape[0] // _CELL
     cells = np.abs(cv2.resize(change, size, interpolation=cv2.INTER_AREA)).sum(2)
@@ -122,30 +122,30 @@ def _side_changed(lines: Picture, before: Picture, at: int) -> bool:
     return any(float(np.median(side)) > _MOVED for side in sides if side.size)
 
 
-def check_untouched(picture: Picture, sensor: SensorModel, name: str) -> None:
-    """Refuse an untouched RGB picture that contradicts its sensor file; `name` is for the message.
+def check_untouched(image: Image, sensor: SensorModel, name: str) -> None:
+    """Refuse an untouched RGB image that contradicts its sensor file; `name` is for the message.
 
     UserError if it is torn or rolled, its channels are exchanged, or it is mirrored, stretched or
     shifted.
     """
-    if fault := find_seam(picture) or _fault(_compare(picture, sensor)):
+    if fault := find_seam(image) or _fault(_compare(image, sensor)):
         raise UserError(
-            f"{name} is no picture of a {sensor.name} as its sensor file shows it: {fault}"
+            f"{name} is no image of a {sensor.name} as its sensor file shows it: {fault}"
         )
 
 
-def check_unpressed(picture: Picture, sensor: SensorModel, name: str) -> None:
-    """Refuse a picture that is taken for untouched, but which the sensor file explains as a press.
+def check_unpressed(image: Image, sensor: SensorModel, name: str) -> None:
+    """Refuse an image that is taken for untouched, but which the sensor file explains as a press.
 
     It holds for plain gels of the unit that the file was made of; dots would be read as change.
     `name` is for the UserError.
     """
     calibration = load(sensor.sensor_file)
     background = calibration.background.astype(np.float32)
-    change = local_change(remove_gain(picture, background), background)
+    change = local_change(remove_gain(image, background), background)
     if sensor.markers is not None or float(change.max()) < _PRESSED:
         return
-    read = explain(DepthEstimator(calibration, _CELL), calibration, picture, background)
+    read = explain(DepthEstimator(calibration, _CELL), calibration, image, background)
     if read.unexplained <= _PRESS_LEFT:
         raise UserError(
             f"{name} begins in touch: its first frames are taken for the untouched gel, but the "
@@ -154,11 +154,11 @@ def check_unpressed(picture: Picture, sensor: SensorModel, name: str) -> None:
 
 
 def check_presses(
-    untouched: Picture, presses: Sequence[Picture], sensor: SensorModel, name: str
+    untouched: Image, presses: Sequence[Image], sensor: SensorModel, name: str
 ) -> None:
     """Refuse presses that the sensor file explains clearly better mirrored or with other channels.
 
-    `check_untouched` has passed the RGB picture of the untouched gel; in the presses dots are
+    `check_untouched` has passed the RGB image of the untouched gel; in the presses dots are
     painted over, and the strongest six are looked at. `name` is for the UserError.
     """
     differences = _compare(untouched, sensor)
@@ -198,7 +198,7 @@ class Explanation:
 
 
 def explain(
-    estimator: DepthEstimator, calibration: SensorCalibration, frame: Picture, background: Counts
+    estimator: DepthEstimator, calibration: SensorCalibration, frame: Image, background: Counts
 ) -> Explanation:
     """Read a frame's depth and compare the frame with the rendering of that depth."""
     depth = estimator.estimate(frame, background)
@@ -212,10 +212,10 @@ def explain(
     return Explanation(depth, left, share)
 
 
-def _compare(picture: Picture, sensor: SensorModel) -> dict[_View | tuple, float]:
-    """Return the difference from the sensor file's picture under each hypothesis."""
+def _compare(image: Image, sensor: SensorModel) -> dict[_View | tuple, float]:
+    """Return the difference from the sensor file's image under each hypothesis."""
     reference = _coarse(load(sensor.sensor_file).background, sensor)
-    given = _coarse(picture, sensor)
+    given = _coarse(image, sensor)
     differences: dict[_View | tuple, float] = {
         view: _difference(view.undo(given), reference) for view in _VIEWS
     }
@@ -244,11 +244,11 @@ def _fault(differences: dict[_View | tuple, float]) -> str:
     )
 
 
-def _coarse(picture: Picture, sensor: SensorModel) -> Cells:
+def _coarse(image: Image, sensor: SensorModel) -> Cells:
     """Return the logarithm of light on coarse cells, without printed dots."""
     rows, columns = sensor.image_shape
     size = columns // _COARSE, rows // _COARSE
-    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     if sensor.markers is not None:
         dot = 2 * round(0.75 * sensor.markers.diameter / sensor.pixel_pitch / _COARSE) + 1
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (dot, dot))

@@ -17,28 +17,28 @@ from touchgoal.runtime.errors import UserError
 _MOST_PIXELS = 50_000_000  # a small file may unpack to gigabytes
 
 
-def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
+def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
     """Read the RGB image of a file; None if it is missing or unreadable.
 
     A grey image gets three equal channels, which is said on stderr. UserError: it has more than 50
     million pixels, transparent ones, or more than 8 bits a channel.
     """
     try:
-        return decode_picture(path.read_bytes(), str(path))
+        return decode_image(path.read_bytes(), str(path))
     except OSError:
         return None
 
 
-def decode_picture(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Decode an image file's bytes, as `read_picture`; `name` is for the message."""
+def decode_image(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Decode an image file's bytes, as `read_image`; `name` is for the message."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(data)) as picture:  # reads the header alone
-                width, height = picture.size
-                alpha = "A" in picture.mode or "transparency" in picture.info
+            with Image.open(io.BytesIO(data)) as opened:  # reads the header alone
+                width, height = opened.size
+                alpha = "A" in opened.mode or "transparency" in opened.info
                 if alpha and width * height <= _MOST_PIXELS:
-                    alpha = np.asarray(picture.convert("RGBA"))[..., 3].min() < 255
+                    alpha = np.asarray(opened.convert("RGBA"))[..., 3].min() < 255
         size = f"{width} x {height} pixels" if width * height > _MOST_PIXELS else ""
     except Image.DecompressionBombError:
         size = "far too many pixels"
@@ -71,6 +71,6 @@ def _say_grey(where: str) -> None:
     print(f"{where}: grey images are measured as RGB with equal channels", file=sys.stderr)
 
 
-def write_picture(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
     """Write an RGB image as `atomic_write` does; cv2.imwrite would hide a full disk."""
-    write_file(path, cv2.imencode(path.suffix, picture[..., ::-1])[1].tobytes())
+    write_file(path, cv2.imencode(path.suffix, image[..., ::-1])[1].tobytes())

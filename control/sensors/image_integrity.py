@@ -1,4 +1,4 @@
-"""Integrity of a picture: decoded without errors, whole, and new in all its parts."""
+"""Integrity of an image: decoded without errors, whole, and new in all its parts."""
 
 import av
 import numpy as np
@@ -6,19 +6,19 @@ from av.error import FFmpegError
 from av.video.reformatter import VideoReformatter
 from jaxtyping import Bool
 
-from touchgoal.control.arrays import Picture
+from touchgoal.control.arrays import Image
 
 _STRICT = "explode+crccheck+bitstream+buffer"
-_BANDS = 8  # bands of a picture, checked for frozen parts
+_BANDS = 8  # bands of an image, checked for frozen parts
 _STRIDE = 4  # pixels between those compared
-_LEARNING = 20  # number of first pictures, which show the bands that sensor noise changes
-_LIVELY = 0.8  # share of these pictures in which a band must change to be watched
+_LEARNING = 20  # number of first images, which show the bands that sensor noise changes
+_LIVELY = 0.8  # share of these images in which a band must change to be watched
 # av 15, which lerobot 0.6 pins, has no argument `threads`.
 _THREADS = {"threads": 1} if int(av.__version__.split(".")[0]) > 15 else {}
 
 
 class JpegDecoder:
-    """FFmpeg's decoder, set to refuse broken pictures instead of patching them."""
+    """FFmpeg's decoder, set to refuse broken images instead of patching them."""
 
     def __init__(self) -> None:
         self._codec = av.CodecContext.create("mjpeg", "r")
@@ -26,8 +26,8 @@ class JpegDecoder:
         self._codec.thread_count = 1
         self._reformatter = VideoReformatter()  # a new one starts and ends a thread per core
 
-    def decode(self, data: bytes) -> Picture | None:
-        """Return the RGB picture; None if it is broken, for example cut off."""
+    def decode(self, data: bytes) -> Image | None:
+        """Return the RGB image; None if it is broken, for example cut off."""
         try:
             frames = self._codec.decode(av.Packet(data))
         except FFmpegError:
@@ -38,18 +38,18 @@ class JpegDecoder:
 
 
 class FrozenParts:
-    """Detector of pictures, or bands of them, that stand still.
+    """Detector of images, or bands of them, that stand still.
 
-    Sensor noise changes every part of a real picture; a band that never changes from the start
+    Sensor noise changes every part of a real image; a band that never changes from the start
     (black, overexposed) is not watched.
     """
 
     def __init__(self) -> None:
-        self._before: Picture | None = None
+        self._before: Image | None = None
         self._changes, self._seen = np.zeros(_BANDS), 0
         self._changed_at = np.zeros(_BANDS)
 
-    def update(self, image: Picture, now: float) -> float:
+    def update(self, image: Image, now: float) -> float:
         """Return the time (s) since which a watched band is unchanged; `now` if none is."""
         before, self._before = self._before, image
         if before is None or before.shape != image.shape:
@@ -66,7 +66,7 @@ class FrozenParts:
         return float(self._changed_at[watched].min())
 
 
-def _differs(image: Picture, before: Picture) -> Bool[np.ndarray, " bands"]:
+def _differs(image: Image, before: Image) -> Bool[np.ndarray, " bands"]:
     a, b = image[::_STRIDE, ::_STRIDE], before[::_STRIDE, ::_STRIDE]
     rows = (a != b).any(axis=(1, 2))
     return np.array([band.any() for band in np.array_split(rows, _BANDS)])

@@ -23,7 +23,7 @@ STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # everything that an image depends 
 _CAMERA_NOISE = 1.5  # counts: lets a driver tell a still scene from a frozen camera
 _TACTILE = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
 
-Picture = UInt8[np.ndarray, "h w 3"]
+Image = UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ Fault = tuple[str, str, float]
 """Name of a stream, which fault (an attribute of `Stream`), until when (s, time.monotonic)."""
 
 
-class PictureTaker:
+class ImageTaker:
     """Renders the images of one scene."""
 
     def __init__(self, scene: Scene, cameras: bool) -> None:
@@ -69,7 +69,7 @@ class PictureTaker:
         mujoco.mj_forward(model, data)
         self._contacts = request.contacts
 
-    def take(self, name: str) -> Picture:
+    def take(self, name: str) -> Image:
         """Render a camera's or a fingertip's image."""
         if name in _TACTILE:
             side = _TACTILE.index(name)
@@ -77,11 +77,11 @@ class PictureTaker:
             return pad.sense(self._data, self._contacts[side], self._scene.rng).image
         assert self._renderer is not None
         self._renderer.update_scene(self._data, name)
-        picture = self._renderer.render()
+        image = self._renderer.render()
         # One field of noise, shifted: drawing noise takes longer than rendering.
-        shift = self._noise_rng.integers(0, picture.shape[:2])
+        shift = self._noise_rng.integers(0, image.shape[:2])
         noise = np.roll(self._noise, shift, axis=(0, 1))
-        return np.clip(picture + noise, 0, 255).astype(np.uint8)
+        return np.clip(image + noise, 0, 255).astype(np.uint8)
 
     def close(self) -> None:
         """Free the OpenGL context."""
@@ -102,7 +102,7 @@ def serve(pipe: Connection, host: str, port: int, names: list[str]) -> None:
         pipe.send(error)
         return
     pipe.send(server.port)
-    taker: PictureTaker | None = None
+    taker: ImageTaker | None = None
     while True:
         message: Scene | RenderRequest | Fault = pipe.recv()
         if isinstance(message, tuple):
@@ -111,7 +111,7 @@ def serve(pipe: Connection, host: str, port: int, names: list[str]) -> None:
         elif isinstance(message, Scene):
             if taker is not None:
                 taker.close()
-            taker = PictureTaker(message, cameras=bool(streams.keys() - set(_TACTILE)))
+            taker = ImageTaker(message, cameras=bool(streams.keys() - set(_TACTILE)))
         else:
             assert taker is not None
             _publish(taker, message, streams)
@@ -119,7 +119,7 @@ def serve(pipe: Connection, host: str, port: int, names: list[str]) -> None:
             pipe.send((sent, time.process_time()))
 
 
-def _publish(taker: PictureTaker, request: RenderRequest, streams: dict[str, Stream]) -> None:
+def _publish(taker: ImageTaker, request: RenderRequest, streams: dict[str, Stream]) -> None:
     viewed = [streams[name] for name in request.due if streams[name].has_viewers]
     if not viewed:
         return

@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.picture_file import read_picture
+from touchgoal.runtime.image_file import read_image
 
 _TABLES = 5
 
 
 @dataclass(frozen=True, eq=False)
-class MarkerPicture:
+class MarkerImage:
     """One image with the other tracker's result."""
 
     path: Path  # image file
@@ -32,10 +32,10 @@ class MarkerPicture:
 
     def frame(self) -> UInt8[np.ndarray, "h w 3"]:
         """Read the RGB image; UserError for a broken file."""
-        picture = read_picture(self.path)
-        if picture is None:
+        image = read_image(self.path)
+        if image is None:
             raise UserError(f"{self.path} is no readable image")
-        return picture
+        return image
 
 
 def has_markers(folder: Path) -> bool:
@@ -43,7 +43,7 @@ def has_markers(folder: Path) -> bool:
     return any(folder.glob("*_*.json"))
 
 
-def read_marker_pictures(folder: Path) -> list[MarkerPicture]:
+def read_marker_images(folder: Path) -> list[MarkerImage]:
     """Read the images of a folder, by name.
 
     UserError: an image is missing, or a file does not hold the tables.
@@ -51,7 +51,7 @@ def read_marker_pictures(folder: Path) -> list[MarkerPicture]:
     return [_read(path) for path in sorted(folder.glob("*_*.json"))]
 
 
-def _read(table: Path) -> MarkerPicture:
+def _read(table: Path) -> MarkerImage:
     path = table.with_suffix(".png")
     if not path.is_file():
         raise UserError(f"{path} is missing, whose markers {table.name} lists")
@@ -61,4 +61,4 @@ def _read(table: Path) -> MarkerPicture:
         tables = np.empty(0)
     if tables.ndim != 3 or len(tables) != _TABLES:
         raise UserError(f"{table} does not hold {_TABLES} tables of the markers' rows and columns")
-    return MarkerPicture(path, np.stack([tables[2], tables[3]], -1), tables[4] >= 0)
+    return MarkerImage(path, np.stack([tables[2], tables[3]], -1), tables[4] >= 0)
