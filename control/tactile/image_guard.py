@@ -37,9 +37,8 @@ _OPEN = 1.5  # factor on the difference within which presses have to decide
 _EXPLAINS = 0.8  # share of the unexplained change that a better order or mirror may leave
 UNEXPLAINED = 0.65  # share of a press's change that a sensor file may leave unexplained
 _PRESSED = 5.0  # counts of local change, less than a light press makes
-_PRESS_LEFT = (
-    0.45  # share left unexplained: real presses on their own unit 0.08 to 0.29, dust from 0.60
-)
+# Share left unexplained: real presses on their own unit 0.08 to 0.49, dust from 0.60.
+_PRESS_LEFT = 0.55
 _MAX_PRESSES = 6  # number of presses that are read
 _CELL = 8  # px of a cell in which changes are averaged; the finest of the depth that is read
 _STRONGEST = 0.1  # share of the image over which the explanation is judged
