@@ -319,7 +319,7 @@ def assign_goals(
                 f"goal '{spec}' is never used: '{taken[wanted[0]]}' before it already applies to "
                 f"{' and '.join(wanted)}; put it first or leave it out"
             )
-        taken |= dict.fromkeys(free, spec)
+        taken.update({modality: spec for modality in free})
     return {name: taken[name] for name in MODALITIES if name in taken}
 
 
