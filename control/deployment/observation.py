@@ -121,9 +121,12 @@ class ObservationReader:
         for key, meter in self._meters.items():
             frame = frames[key]
             if key not in self._indentations or self._indentations[key][0] != frame.sequence:
-                self._indentations[key] = frame.sequence, meter.measure(frame.image)
                 if wrong := self._health[key].update(frame.image):
                     fault = f"{key.removeprefix(ft.IMAGE_PREFIX)}: {wrong}"
+                before = self._indentations.get(key, (0, 0.0))[1]
+                doubtful = self._health[key].doubtful
+                depth = before if doubtful else meter.measure(frame.image)
+                self._indentations[key] = frame.sequence, depth
         depths = [self._indentations[k][1] if k in self._indentations else 0.0 for k in ft.TACTILE]
         return np.array(depths), fault
 

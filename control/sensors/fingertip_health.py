@@ -25,6 +25,11 @@ class FingertipHealth:
         self._sensor, self._parts = sensor, FrozenParts()
         self._frames = self._bad = 0
 
+    @property
+    def doubtful(self) -> bool:
+        """Whether the newest frame shows a fault, so that nothing is to be read from it."""
+        return self._bad > 0
+
     def update(self, frame: Picture) -> str:
         """Take the next new RGB frame; return what is wrong with the fingertip, "" if nothing."""
         self._frames += 1
