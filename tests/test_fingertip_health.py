@@ -1,12 +1,13 @@
 """A fingertip that dies, from the start or in the run, is named before anything is pressed."""
 
 import io
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_cell import FakeCamera, FakeCell, KeptTicks, write_cell_file
+from fake_cell import FakeCamera, FakeCell, FakeClock, KeptTicks, write_cell_file
 from PIL import Image
 
 from touchgoal.control import features as ft
@@ -18,6 +19,7 @@ from touchgoal.control.deployment.session import Session
 from touchgoal.control.interfaces import Frame, TactileSensor
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
+from touchgoal.control.sensors.exchanged import probe_fingertips
 from touchgoal.control.sensors.fingertip_health import FingertipHealth
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
@@ -76,12 +78,13 @@ class DyingTip:
 class LiveTip(FakeCamera):
     """An untouched fingertip with a sensor's noise; a new frame every 40 ms."""
 
-    model = GELSIGHT_MINI
+    model, pressed = GELSIGHT_MINI, False
 
     def read(self) -> Frame:
         number = round(self.clock.time / 0.04)
-        background = load(self.model.sensor_file).background
-        return Frame(live(background, np.random.default_rng(number)), number, self.clock.time)
+        shown = load(self.model.sensor_file).background.copy()
+        shown[100:140, 140:180] += np.uint8(60 * self.pressed)
+        return Frame(live(shown, np.random.default_rng(number)), number, self.clock.time)
 
 
 def fake_cell(fault: str, since: float) -> FakeCell:
@@ -126,6 +129,30 @@ def test_the_preflight_names_a_dead_fingertip(fault: str, tmp_path: Path) -> Non
     left, right = (next(x for x in lines if x.name == k.split(".")[-1]) for k in ft.TACTILE)
     assert right.ok and left.ok == (not fault)
     assert (NAMED | {"quality 30": "compressed", "": ""})[fault] in left.remedy
+
+
+@pytest.mark.parametrize(
+    ("felt_by", "message"),
+    [
+        ("lr", ""),
+        ("rl", "the right fingertip felt the touch of the left"),
+        ("l-", "right .* no touch"),
+    ],
+)
+def test_each_fingertip_answers_on_its_own_side(felt_by: str, message: str) -> None:
+    tips = {name: LiveTip(FakeClock(), np.zeros(0)) for name in ("left", "right")}
+    asked: list[str] = []
+
+    def wait(seconds: float) -> None:
+        """Press 2 s after each question, for half a second, what `felt_by` names for it."""
+        for name, tip in tips.items():
+            tip.clock.time += seconds
+            since = tip.clock.time - (len(asked) - 1) * 2.5
+            tip.pressed = 2 <= since < 2.5 and felt_by[len(asked) - 1] == name[0]
+
+    with pytest.raises(UserError, match=message) if message else nullcontext():
+        probe_fingertips(tips, asked.append, wait)
+    assert [line.split()[2] for line in asked] == ["left", "right"][: 1 if felt_by == "rl" else 2]
 
 
 def run_simulated(task: str, fault: str, since: float, folder: Path) -> tuple[Ending, float]:
