@@ -155,7 +155,7 @@ def check_fingertips(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
     looked_at = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)]
     first: list[UInt8[np.ndarray, "h w 3"]] = []
     for i in sorted(set(looked_at)) if keys else ():
-        start = range(min(_BACKGROUND_FRAMES, episodes.lengths[i]))
+        start = range(min(SETTLES_WITHIN, episodes.lengths[i]))
         read = episodes.read(i, keys, start).frames
         frames = [read[key][0] for key in keys]
         sensor = SENSORS.get(str(episodes.meta(i).get("sensor")))

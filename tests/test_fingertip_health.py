@@ -18,9 +18,9 @@ from touchgoal.control.deployment.preflight import preflight
 from touchgoal.control.deployment.session import Session
 from touchgoal.control.interfaces import Frame, TactileSensor
 from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.safety.fingertip_health import FingertipHealth
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.sensors.exchanged import probe_fingertips
-from touchgoal.control.sensors.fingertip_health import FingertipHealth
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.launch.deploy import load_policy
@@ -31,19 +31,19 @@ NAMED = {"black": "is black", "frozen": "stands still", "noise": "is noise", "wh
 TIPS = 'gripper = { kind = "franka_hand" }\ncameras.front = { source = "simulated" }\nfingertips = '
 
 
-def live(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    noisy = picture + rng.normal(0, 1.5, picture.shape)
+def live(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    noisy = image + rng.normal(0, 1.5, image.shape)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-def compressed(picture: np.ndarray, quality: int) -> np.ndarray:
-    Image.fromarray(picture).save(data := io.BytesIO(), "JPEG", quality=quality)
+def compressed(image: np.ndarray, quality: int) -> np.ndarray:
+    Image.fromarray(image).save(data := io.BytesIO(), "JPEG", quality=quality)
     return np.array(Image.open(data))
 
 
 @dataclass
 class DyingTip:
-    """A fingertip whose picture has a fault from a time (s) on."""
+    """A fingertip whose image has a fault from a time (s) on."""
 
     tip: TactileSensor
     fault: str
@@ -99,12 +99,12 @@ def fake_cell(fault: str, since: float) -> FakeCell:
 @pytest.mark.parametrize("fault", NAMED)
 def test_a_dead_fingertip_ends_the_run_or_keeps_it_from_beginning(fault: str, since: float) -> None:
     cell = fake_cell(fault, since)
-    if not since and fault != "frozen":  # which one picture does not show
-        with pytest.raises(UserError, match=f"tactile_left: its picture.* {NAMED[fault]}"):
+    if not since and fault != "frozen":  # which one image does not show
+        with pytest.raises(UserError, match=f"tactile_left: its image.* {NAMED[fault]}"):
             cell.run(lambda _: None)
         return
     ending = cell.run(lambda _: None)
-    assert ending.stopped and ending.reason.startswith("tactile_left: its picture")
+    assert ending.stopped and ending.reason.startswith("tactile_left: its image")
     assert NAMED[fault] in ending.reason and len(cell.rows) <= 20 * since + 9
 
 
@@ -192,5 +192,5 @@ def test_a_fingertip_that_dies_in_a_task_is_named_before_it_crushes(
         options = 'policy = "shipped", wires = ["helix-3"]'
     text = f'task = {{ name = "{task}", seed = 3, {options} }}\n'
     ending, force = run_simulated(text, fault, since, tmp_path)
-    assert ending.stopped and ending.reason.startswith("tactile_right: its picture")
+    assert ending.stopped and ending.reason.startswith("tactile_right: its image")
     assert NAMED[fault] in ending.reason and force < 15

@@ -19,7 +19,7 @@ from touchgoal.control.interfaces import (
 )
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_vector
-from touchgoal.control.sensors.fingertip_health import FingertipHealth, picture_fault
+from touchgoal.control.safety.fingertip_health import FingertipHealth, image_fault
 from touchgoal.control.tactile.indentation import IndentationMeter
 from touchgoal.runtime.errors import UserError
 
@@ -60,7 +60,7 @@ class ObservationReader:
         self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
         tips = {k: c for k, c in connection.cameras.items() if isinstance(c, TactileSensor)}
         for key, tip in tips.items():
-            if wrong := picture_fault(tip.read().image, tip.model):
+            if wrong := image_fault(tip.read().image, tip.model):
                 raise UserError(f"{key.removeprefix(ft.IMAGE_PREFIX)}: {wrong}")
         self._health = {key: FingertipHealth(tip.model) for key, tip in tips.items()}
         self._meters = {

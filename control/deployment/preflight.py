@@ -18,9 +18,9 @@ from touchgoal.control.deployment.hand import require_empty_hand
 from touchgoal.control.interfaces import Camera, TactileSensor
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.safety.fingertip_health import FingertipHealth
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.control.sensors.exchanged import fingertips_exchanged
-from touchgoal.control.sensors.fingertip_health import FingertipHealth
 from touchgoal.control.tactile.contact import coarse, contact_strength, threshold_for
 from touchgoal.control.tactile.image_guard import check_untouched
 from touchgoal.control.tactile.indentation import require_readable
@@ -85,11 +85,11 @@ def preflight(
     return [_run_check(*check) for check in checks]
 
 
-def watch_cameras(connection: CellConnection) -> tuple[dict[str, float], dict[str, list[Picture]]]:
+def watch_cameras(connection: CellConnection) -> tuple[dict[str, float], dict[str, list[Image]]]:
     """Return the rate of each camera (Hz), by the connection's clock, and each fingertip's frames."""
     clock, begin = connection.clock, connection.clock.now()
     before = _sequences(connection)
-    found: dict[str, dict[int, Picture]] = {}
+    found: dict[str, dict[int, Image]] = {}
     while clock.now() < begin + _WATCH_SECONDS - 1e-9:
         clock.wait(min(clock.now() + _WATCH_INTERVAL, begin + _WATCH_SECONDS))
         for key, camera in connection.cameras.items():
@@ -201,7 +201,7 @@ def _gripper(cell: CellConfig, connection: CellConnection) -> str:
     return f"{1e3 * reading.width:.0f} mm wide{holds}"
 
 
-def _camera(camera: Camera, rate: float, nominal: float, frames: list[Picture]) -> str:
+def _camera(camera: Camera, rate: float, nominal: float, frames: list[Image]) -> str:
     if camera.problem:
         raise UserError(camera.problem)
     untouched = ""

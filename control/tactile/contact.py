@@ -92,10 +92,10 @@ def threshold_for(untouched: Images, background: Image) -> float:
 
 
 def coarse(threshold: float) -> str:
-    """Return what is wrong with pictures that need so high a contact threshold; "" if nothing."""
+    """Return what is wrong with images that need so high a contact threshold; "" if nothing."""
     if threshold <= _COARSE:
         return ""
     return (
-        f"its pictures are so compressed or noisy that contact needs {threshold:.1f} counts, above "
+        f"its images are so compressed or noisy that contact needs {threshold:.1f} counts, above "
         f"{_COARSE:g} light touches are missed: send or store them at JPEG quality 90 or without loss"
     )

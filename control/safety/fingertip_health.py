@@ -1,10 +1,10 @@
-"""Health of a fingertip from its pictures: light, noise, and that they change."""
+"""Health of a fingertip from its images: light, noise, and that they change."""
 
 import cv2
 import numpy as np
 
-from touchgoal.control.arrays import Picture
-from touchgoal.control.sensors.picture_integrity import FrozenParts
+from touchgoal.control.arrays import Image
+from touchgoal.control.sensors.image_integrity import FrozenParts
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import SensorModel
 
@@ -30,29 +30,29 @@ class FingertipHealth:
         """Whether the newest frame shows a fault, so that nothing is to be read from it."""
         return self._bad > 0
 
-    def update(self, frame: Picture) -> str:
+    def update(self, frame: Image) -> str:
         """Take the next new RGB frame; return what is wrong with the fingertip, "" if nothing."""
         self._frames += 1
         if self._frames - self._parts.update(frame, self._frames) >= _STILL:
-            return "its picture or a part of it stands still: check its cable and driver"
-        wrong = picture_fault(frame, self._sensor)
+            return "its image or a part of it stands still: check its cable and driver"
+        wrong = image_fault(frame, self._sensor)
         self._bad = self._bad + 1 if wrong else 0
         return wrong if self._bad >= _CONFIRMING else ""
 
 
-def picture_fault(frame: Picture, sensor: SensorModel) -> str:
-    """Return what is wrong with one RGB picture of a fingertip, touched or not; "" if nothing."""
+def image_fault(frame: Image, sensor: SensorModel) -> str:
+    """Return what is wrong with one RGB image of a fingertip, touched or not; "" if nothing."""
     light = float(frame.mean())
     if light < _DARK * float(load(sensor.sensor_file).background.mean()):
-        return "its picture is black: check its light and cable"
+        return "its image is black: check its light and cable"
     if light > _BRIGHT:
-        return "its picture is overexposed: check its exposure"
+        return "its image is overexposed: check its exposure"
     if (noise := _noise(frame)) > _NOISY:
-        return f"its picture is noise ({noise:.0f} counts, a sensor's is below 5): check its cable"
+        return f"its image is noise ({noise:.0f} counts, a sensor's is below 5): check its cable"
     return ""
 
 
-def _noise(frame: Picture) -> float:
+def _noise(frame: Image) -> float:
     """Return the mean second difference of the middle cell (counts): dots and edges are few."""
     x = frame.astype(np.int16)
     rough = np.abs(x[:, 2:] - 2 * x[:, 1:-1] + x[:, :-2]).mean(2, dtype=np.float32)
