@@ -58,7 +58,11 @@ KINDS = {
     "changes in degrees": (scaled(np.rad2deg(1)), "change", "tick in degrees: store radians"),
     "velocities": (scaled(20), "change", "are joint velocities: store the joint change"),
     "gripper 0..1": (scaled(1, 12.5), "change", "gripper goes from 0.03 to 1, which is no width"),
-    "nonsense": (lambda s, a: a + [3, -2, 1, 4, 3, 5, 2, 0], "change", "are no joint change"),
+    "nonsense": (
+        lambda s, a: a + np.array([3, -2, 1, 4, 3, 5, 2, 0]),
+        "change",
+        "are no joint change",
+    ),
 }
 
 

@@ -161,9 +161,9 @@ def run_simulated(task: str, fault: str, since: float, folder: Path) -> tuple[En
     tips = f'{{ sensor = "{sensor}", left = "simulated", right = "simulated" }}'
     cell = read_cell_file(write_cell_file(folder, f'arm = "sim"\n{TIPS}{tips}\n{task}'))
     connection = simulate_cell(cell, ft.CONTROL_HZ)
-    connection.cameras[ft.TACTILE_RIGHT] = DyingTip(
-        connection.cameras[ft.TACTILE_RIGHT], fault, since
-    )
+    tip = connection.cameras[ft.TACTILE_RIGHT]
+    assert isinstance(tip, TactileSensor)
+    connection.cameras[ft.TACTILE_RIGHT] = DyingTip(tip, fault, since)
     policy, size = load_policy(cell)
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ)
     result = Session(
