@@ -85,9 +85,9 @@ def _errors(
     window = min(_WINDOW, len(q) - 1)
     if window < 1:
         return {}
-    total = np.cumsum(action, 0, np.float64)[window - 1 : -1]
-    total[1:] -= np.cumsum(action, 0, np.float64)[: len(total) - 1]
     start, last, after = q[:-window], action[window - 1 : -1], q[window:]
+    done = np.cumsum(action, 0, np.float64) - action  # before each tick
+    total = done[window:] - done[:-window]
     predicted = {
         _NAMES["change"]: start + total,
         _NAMES["absolute"]: last,

@@ -159,8 +159,9 @@ def check_fingertips(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
         read = episodes.read(i, keys, start).frames
         frames = [read[key][0] for key in keys]
         sensor = SENSORS.get(str(episodes.meta(i).get("sensor")))
-        for key in keys if sensor is not None else ():
-            check_touch(read[key], sensor, f"{key} of episode {i} of {episodes.root}")
+        for key in keys:
+            if sensor is not None:
+                check_touch(read[key], sensor, f"{key} of episode {i} of {episodes.root}")
         first = first or frames
         if len(keys) == 2 and _exchanged((frames[0], frames[1]), (first[0], first[1])):
             raise UserError(

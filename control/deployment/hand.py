@@ -57,7 +57,7 @@ class HeldObject:
 
 
 class HandMonitor:
-    """Finds a hand that does not move as commanded, or an object that a fingertip does not feel.
+    """Finds a hand that does not move as commanded, or reports an object that no fingertip touches.
 
     Once a command is sent the width must change, or an object be grasped, within stroke / speed +
     0.5 s.
@@ -88,7 +88,7 @@ class HandMonitor:
             self._width = gripper.width
         still = not moves and not self._follows(gripper, commanded)
         self._still_since = min(self._still_since, sent_at) if still else np.inf
-        untouched = gripper.grasped and indentation is not None and not indentation.all()
+        untouched = gripper.grasped and indentation is not None and not indentation.any()
         self._untouched_since = min(self._untouched_since, sent_at) if untouched else np.inf
         if (still := time - self._still_since) > self._timeout:
             return (
@@ -96,11 +96,9 @@ class HandMonitor:
                 f"{1e3 * gripper.width:.0f} mm for {still:.1f} s"
             )
         if (untouched := time - self._untouched_since) > self._timeout:
-            assert indentation is not None
-            silent = " and ".join(np.array(["left", "right"])[indentation == 0])
             return (
-                f"the hand reports an object {1e3 * gripper.width:.0f} mm wide, but the {silent} "
-                f"fingertip felt nothing for {untouched:.1f} s"
+                f"the hand reports an object {1e3 * gripper.width:.0f} mm wide, but neither fingertip "
+                f"has touched anything for {untouched:.1f} s"
             )
         return ""
 
