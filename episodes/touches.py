@@ -15,9 +15,9 @@ from touchgoal.control.tactile.background import (
     local_change,
     untouched_frames,
 )
-from touchgoal.control.tactile.contact import ContactDetector, threshold_for
+from touchgoal.control.tactile.contact import ContactDetector, coarse, threshold_for
 from touchgoal.control.tactile.image_guard import check_untouched
-from touchgoal.control.tactile.sensor_models import SENSORS
+from touchgoal.control.tactile.sensor_models import SENSORS, SensorModel
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
@@ -149,18 +149,19 @@ def check_fingertips(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
 
     The first frames of some episodes are compared with the sensor file, and with each other.
 
-    UserError: see `image_guard.check_untouched`; or two episodes have them exchanged.
+    UserError: see `check_touch`; or two episodes have them exchanged.
     """
     keys = [key for key in TACTILE if key in episodes.features]
     looked_at = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)]
     first: list[UInt8[np.ndarray, "h w 3"]] = []
     for i in sorted(set(looked_at)) if keys else ():
-        read = episodes.read(i, keys, [0]).frames
+        start = range(min(SETTLES_WITHIN, episodes.lengths[i]))
+        read = episodes.read(i, keys, start).frames
         frames = [read[key][0] for key in keys]
         sensor = SENSORS.get(str(episodes.meta(i).get("sensor")))
-        for key, frame in zip(keys, frames, strict=True):
+        for key in keys:
             if sensor is not None:
-                check_untouched(frame, sensor, f"{key} of episode {i} of {episodes.root}")
+                check_touch(read[key], sensor, f"{key} of episode {i} of {episodes.root}")
         first = first or frames
         if len(keys) == 2 and _exchanged((frames[0], frames[1]), (first[0], first[1])):
             raise UserError(
@@ -173,6 +174,17 @@ def _exchanged(frames: tuple[Image, Image], first: tuple[Image, Image]) -> bool:
     """Whether the same two sensors changed sides; new sensors, as simulation draws them, do not count."""
     crossed = max(float(local_change(frames[k], first[1 - k]).mean()) for k in (0, 1))
     return crossed < _SAME_SENSOR and fingertips_exchanged(frames, first)
+
+
+def check_touch(frames: UInt8[np.ndarray, "n h w 3"], sensor: SensorModel, name: str) -> None:
+    """Refuse a fingertip whose first 5 frames contradict its sensor file, or are too compressed.
+
+    `name` is for the UserError; see `image_guard.check_untouched` and `contact.coarse`.
+    """
+    background = touch_background(frames)
+    check_untouched(background, sensor, name)
+    if wrong := coarse(threshold_for(untouched_frames(frames), background)):
+        raise UserError(f"{name}: {wrong}")
 
 
 def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

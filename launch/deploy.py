@@ -45,7 +45,7 @@ class Config:
     execute: bool = False
     """Move the arm. Without it this is a dry run."""
     yes: bool = False
-    """Do not ask for the typed confirmation (for tests)."""
+    """Do not ask for a touch of each fingertip and the typed confirmation (for tests)."""
     sim: bool = False
     """Use a simulated arm in place of the cell file's."""
     seed: Seed | None = None
@@ -162,7 +162,7 @@ def _deploy(
 
     safety = check_cell(cell, connection, episodes)
     if config.execute and not config.yes:
-        confirm(cell)
+        confirm(cell, connection)
     terminal = Terminal()
     log = _shown_in(stream, safety.dt) if stream is not None else None
     session = Session(

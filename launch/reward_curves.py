@@ -134,6 +134,6 @@ def main(config: Config) -> None:
     threshold = None if config.plain else load_success_threshold(config.normalizer)
     audited = source.trajectories[: config.audit]
     audit = audit_trajectories(audited, rewards).table if audited else ""
-    report_all(measurement.records, out, first.provenance(), threshold, audit)
+    unfit = report_all(measurement.records, out, first.provenance(), threshold, audit)
     print(f"{summary}; {speed}")
-    print(f"next: look at {out / PAGE}; train on {out / FRAMES}")
+    print(unfit or f"next: look at {out / PAGE}; train on {out / FRAMES}")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, cast
 
 from touchgoal.encoders.training.options import TrainingOptions
+from touchgoal.episodes.action_meaning import ActionMeaning
 from touchgoal.policies.config import (
     ActionRepresentation,
     ArmState,
@@ -92,6 +93,9 @@ class Config(TrainingOptions):
     """Default hyperparameters: for two CPU cores; for some fifty recordings with cameras front and
     wrist; or as published for the bead maze (Sparsh C.7, diffusion_policy): U-Net of 87 M, 100 DDPM
     steps, joint changes, 600 epochs, days on a CPU."""
+    actions: Annotated[ActionMeaning, RARE] = "change"
+    """Meaning of the recorded actions: change (joint change per tick, as touchgoal records), absolute
+    (joint positions) or relative (joint change since the episode's start)."""
     include_unknown: Annotated[bool, RARE] = False
     """Also train on episodes that do not say whether they succeeded."""
     progress: Path | None = None
@@ -169,13 +173,18 @@ def main(config: Config) -> None:
     from touchgoal.encoders.pretrained import find_encoder
     from touchgoal.encoders.training.run import check_run, open_sets, open_training, recipe
     from touchgoal.encoders.training.trainer import is_first_process
+    from touchgoal.episodes.action_meaning import check_actions
     from touchgoal.episodes.keys import parse_keys
     from touchgoal.policies.checkpoint import ESTIMATOR, TOUCH
     from touchgoal.policies.perception.frozen_touch import load_touch
     from touchgoal.policies.perception.state_estimation import load_pose_estimator
     from touchgoal.policies.training import training_data
     from touchgoal.policies.training.model_selection import copy_parts, score, select
-    from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
+    from touchgoal.policies.training.sequence_dataset import (
+        SequenceDataset,
+        check_arm,
+        load_recordings,
+    )
     from touchgoal.policies.training.train import POLICY, train
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.json_file import write_json
@@ -205,17 +214,21 @@ def main(config: Config) -> None:
     reads_touch = config.encoder or config.end_to_end
     sensor = training_data.common_sensor(chosen) if reads_touch else ""
     env = _env(config.env, simulated, sensor) if simulated else None
-    pauses = [training_data.find_pauses(*one) for one in chosen]
     policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
+    for one in sets:
+        check_arm(one)
+    meant = [check_actions(*one, config.actions) for one in chosen]
+    pauses = [training_data.find_pauses(*one, config.actions) for one in chosen]
     out = open_training(config, "train-policy")
     print(f"{task}: {found[0]} for training, {found[1]} for validation")
+    print(meant[0])
     if not simulated:
         print(f"no simulator knows {task!r}: snapshots are not tried, the last one is taken")
     training_data.report_pauses(pauses[0], sets[0].fps, config.trim_pauses)
     skipped = pauses if config.trim_pauses else [None, None]
     workers = config.ray or config.workers
     recordings = (
-        load_recordings(s, r, policy, touch, workers, skip=skip)
+        load_recordings(s, r, policy, touch, workers, skip, config.actions)
         for (s, r), skip in zip(chosen, skipped, strict=True)
     )
     first, other = recordings

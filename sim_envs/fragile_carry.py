@@ -33,6 +33,9 @@ _DROP = 0.012  # m of sliding along the pads after which the rod is lost
 _MAX_TILT = np.radians(12)
 _LEVEL_TILT, _LEVEL_HEIGHT, _STILL_SPEED = np.radians(3), 1.5e-3, 0.01  # rad, m, m/s
 _CRUSH_TICKS = 2  # successive control ticks above the crush force that break the rod
+# m of each finger from the rod at first: it closes over the first five frames, which show the
+# fingertips untouched, as their background
+_OPENING = 0.016
 _TUG_SECONDS = 0.3
 _HOLD_FORCE = 1.0, 8.0  # N of each finger that just holds the rod, drawn log-uniformly
 _CRUSH_RATIO = 2.5  # force of a finger that crushes the rod, relative to the one that just holds it
@@ -128,7 +131,7 @@ class FragileCarry(FrankaTactileEnv):
 
     def _let_settle(self) -> None:
         """Open the hand around the rod."""
-        self._finger_target = RADIUS + 0.003
+        self._finger_target = RADIUS + _OPENING
         self.data.qpos[self._fingers] = self._finger_target
         self._run_tick(np.zeros(self.n_joints), 2 * self._finger_target, seconds=0.1)
 

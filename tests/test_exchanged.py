@@ -50,6 +50,16 @@ def test_exchanged_fingertips_are_noticed_at_every_start() -> None:
         assert not fingertips_exchanged((frames[0], frames[1]), (left, left)), "one file for both"
 
 
+class LiveCamera(FakeCamera):
+    """A camera with a sensor's noise, without which its image would stand still."""
+
+    def read(self) -> Frame:
+        frame = super().read()
+        noise = np.random.default_rng(frame.sequence).integers(-1, 2, frame.image.shape)
+        noisy = np.clip(frame.image.astype(int) + noise, 0, 255).astype(np.uint8)
+        return Frame(noisy, frame.sequence, frame.stamp)
+
+
 def preflighted(
     images: list[np.ndarray], untouched: list[np.ndarray], folder: Path
 ) -> dict[str, CheckResult]:
@@ -59,7 +69,7 @@ def preflighted(
         files.append(str(folder / key))
         shutil.copytree(GELSIGHT_MINI.sensor_file, files[-1])
         cv2.imwrite(f"{files[-1]}/background.png", background[..., ::-1])
-        camera = FakeCamera(cell.clock, image)
+        camera = LiveCamera(cell.clock, image)
         cell.cameras[key] = TactileCamera(camera, find_sensor(files[-1]), NO_CROP)
     tips = 'fingertips = { sensor = "gelsight_mini", left = "http://l", right = "http://r", '
     file = write_cell_file(folder, f"{tips}sensor_files = {files} }}\n{SIM}")

@@ -54,6 +54,8 @@ def test_expert_recovers_from_a_disturbed_squeeze() -> None:
     episode = record_episode(env, EpisodeSpec(seed=1))
     assert episode.meta["success"] and episode.meta["task"] == "fragile-carry"
     assert np.ptp(episode.frames[ft.STATE][30:, -1]) > 0  # the width varies
+    touched = np.flatnonzero(episode.frames[ft.TRUTH_CONTACT].any(1))
+    assert 5 < touched[0] < 10, "the first frames are the fingertips' background"
 
 
 def test_commands_from_demonstrations_to_a_table(tmp_path: Path, capsys) -> None:

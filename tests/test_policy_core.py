@@ -76,8 +76,11 @@ def test_what_makes_progress_is_drawn_and_what_loses_it_is_not(tmp_path: Path) -
     pq.write_table(pa.table(table), path := tmp_path / "progress.parquet")
     progress = read_progress(path, [4, 7], [3, 20])
     weights = progress_weights(progress, ahead=2)
-    assert (weights[3:11] == 1).all() and (weights[13:-1] == 0).all()
-    assert ((weights[:3] > 0) & (weights[:3] < 1)).all(), "without progress: in part"
+    assert (weights[3:11] == 1).all() and (weights[13:] == 0).all()
+    assert ((weights[:2] > 0) & (weights[:2] < 1)).all(), "without progress: in part"
+    assert weights[2] == 0, "no action follows the last frame"
+    with pytest.raises(UserError, match="no frame of --data makes progress"):
+        progress_weights([np.linspace(1, 0, 9), np.linspace(0.5, 0.1, 9)], ahead=2)
     drawn = SequenceDataset(toy_dataset(TOY, (3, 20)).recorded, TOY, weights).draw(
         torch.arange(23).repeat(200), BatchNoise(torch_rng())
     )

@@ -1,7 +1,9 @@
 """Work on a Ray cluster of two nodes, one of which is lost, and on processes that are killed."""
 
+import json
 import math
 import multiprocessing
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -18,6 +20,7 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.rewards.report.frame_table import FRAMES
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.parallel.worker_pool import one_core_workers
 
@@ -101,3 +104,24 @@ def test_an_error_while_large_results_come_ends_the_workers() -> None:
         next(results)
         raise UserError("the disk is full")
     assert not multiprocessing.active_children()
+
+
+def test_a_script_without_a_main_guard_is_told_of_it(tmp_path: Path) -> None:
+    script, work = (
+        tmp_path / "script.py",
+        "with parallel_map(abs, [1], 1) as found:\n    list(found)\n",
+    )
+    script.write_text(
+        f"from touchgoal.runtime.parallel.parallel_map import parallel_map\n{work}", "utf-8"
+    )
+    run = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
+    assert f"workers run {script} anew" in run.stderr and "memory" not in run.stderr
+
+
+def test_no_json_file_holds_what_is_no_json(tmp_path: Path) -> None:
+    write_json(
+        tmp_path / "a.json", {"a": [np.float32("nan"), (np.inf, 1.5)], "b": tmp_path, "c": None}
+    )
+    text = (tmp_path / "a.json").read_text()
+    assert json.loads(text) == {"a": [None, [None, 1.5]], "b": str(tmp_path), "c": None}
+    assert "Infinity" not in text and "NaN" not in text

@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,15 +20,18 @@ from toy_towers import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
 from touchgoal.episodes.media import write_video
+from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
+from touchgoal.rewards.curves import Contact, Curves
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import Bank, OwnFrame
 from touchgoal.rewards.measure import Measurement, embed_here, write_skipped
 from touchgoal.rewards.report.page import write_pages
-from touchgoal.rewards.report.record import Record, load_facts
+from touchgoal.rewards.report.record import Record, load_facts, record_of
 from touchgoal.rewards.report.report import report_all
 from touchgoal.rewards.report.tables import outcome_table
+from touchgoal.rewards.report.thumbnails import Thumbnails
 from touchgoal.rewards.reward import Reward
 from touchgoal.rewards.sources import trajectory
 from touchgoal.rewards.sources.episode_trajectories import default_goals
@@ -163,6 +166,33 @@ def test_no_failure_is_measured_to_its_own_end(episodes: Path, tmp_path: Path) -
     (tmp_path / "labels.csv").write_text("file,outcome\nx.mp4,drop\n")
     with pytest.raises(UserError, match="x failed, and .* --goal image:FILE"):
         default_goals(open_source(tmp_path / "x.mp4", "front").trajectories)
+
+
+class Recorded(trajectory.Trajectory):
+    """A recording of which nothing is read."""
+
+    def checksum(self) -> str:
+        return ""
+
+    def chunks(self) -> Iterator[Episode]:
+        yield from ()
+
+
+@pytest.mark.parametrize(
+    ("touch", "unfit"),
+    [([0.0, 0.02, 0.6, 0.5, 0.0], True), ([0.9, 0.8, 0.6, 0.2, 0.0], False)],
+    ids=["the hand lets go at the end", "it holds at the end"],
+)
+def test_no_training_on_an_untouched_goal(touch: list[float], unfit: bool, tmp_path: Path) -> None:
+    contact, raw = Contact(2, "detected"), {"tactile": np.array(touch)}
+    curves = Curves("a#0", {"tactile": "last"}, 20.0, contact, raw, {})
+    seen = Thumbnails(5)
+    seen.add(Episode({TACTILE_LEFT: np.zeros((len(seen.planned), 24, 32, 3), np.uint8)}, "hold"))
+    record = record_of(curves, Recorded("a", "a#0", 0, 0, 5, 20.0, {}), seen)
+    assert record.facts.goal_untouched == unfit
+    record.save(path := tmp_path / "a.npz")
+    said = report_all([path], tmp_path, {})
+    assert said.startswith("in 1 of 1 the goal is untouched") if unfit else said == ""
 
 
 def test_outcomes_are_compared_by_goals_of_others_alone() -> None:

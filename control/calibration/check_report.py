@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from touchgoal.control.arrays import Image
 from touchgoal.control.calibration.sensor_check import PressReading, SensorCheck
 from touchgoal.control.tactile.background import Drift
+from touchgoal.control.tactile.contact import coarse
 from touchgoal.control.tactile.image_guard import UNEXPLAINED
 
 _SHOWN = 4  # presses in the image
@@ -129,6 +130,8 @@ def _row(press: PressReading, background: Image) -> np.ndarray:
 def _contact(check: SensorCheck) -> str:
     line = f"contact      from {check.threshold:.1f} counts on; untouched frames reach "
     line += f"{check.untouched:.1f}"
+    if wrong := coarse(check.threshold):
+        line += f"\n             {wrong}"
     if not check.touched:
         return line + "; nothing touched"
     line += f", touches {check.touched:.1f}"

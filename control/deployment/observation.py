@@ -19,6 +19,7 @@ from touchgoal.control.interfaces import (
 )
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_vector
+from touchgoal.control.safety.fingertip_health import FingertipHealth, image_fault
 from touchgoal.control.tactile.indentation import IndentationMeter
 from touchgoal.runtime.errors import UserError
 
@@ -57,10 +58,13 @@ class ObservationReader:
                 )
         robot = connection.robot
         self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
+        tips = {k: c for k, c in connection.cameras.items() if isinstance(c, TactileSensor)}
+        for key, tip in tips.items():
+            if wrong := image_fault(tip.read().image, tip.model):
+                raise UserError(f"{key.removeprefix(ft.IMAGE_PREFIX)}: {wrong}")
+        self._health = {key: FingertipHealth(tip.model) for key, tip in tips.items()}
         self._meters = {
-            key: IndentationMeter(camera.model, camera.read().image)
-            for key, camera in connection.cameras.items()
-            if isinstance(camera, TactileSensor)
+            key: IndentationMeter(tip.model, tip.read().image) for key, tip in tips.items()
         }
         self.has_fingertips = bool(self._meters)  # whether `indentation` is measured
         self._indentations: dict[str, tuple[int, float]] = {}  # frame's sequence, depth (m)
@@ -87,7 +91,8 @@ class ObservationReader:
         for key, frame in frames.items():
             tactile = key in ft.TACTILE
             observation[key] = frame.image if tactile else crop_and_resize(frame.image, self._size)
-        age, indentation = ages.get(oldest, 0.0), self._indentation(frames)
+        age, (indentation, wrong) = ages.get(oldest, 0.0), self._indentation(frames)
+        fault = fault or wrong
         return CellReading(observation, arm, gripper, load, age, oldest, indentation, fault)
 
     def _without_nan(
@@ -110,15 +115,20 @@ class ObservationReader:
             raise DriverError("the arm's joint positions are not numbers: restart its controller")
         return replace(self._arm, fault=arm.fault), replace(self._gripper, fault=gripper.fault)
 
-    def _indentation(self, frames: dict[str, Frame]) -> Float[np.ndarray, "2"]:
-        """Return the depth in both gels; every image is measured once."""
+    def _indentation(self, frames: dict[str, Frame]) -> tuple[Float[np.ndarray, "2"], str]:
+        """Return the depth in both gels, and a fingertip's fault; every image is measured once."""
+        fault = ""
         for key, meter in self._meters.items():
             frame = frames[key]
             if key not in self._indentations or self._indentations[key][0] != frame.sequence:
-                self._indentations[key] = frame.sequence, meter.measure(frame.image)
-        return np.array(
-            [self._indentations[key][1] if key in self._indentations else 0.0 for key in ft.TACTILE]
-        )
+                if wrong := self._health[key].update(frame.image):
+                    fault = f"{key.removeprefix(ft.IMAGE_PREFIX)}: {wrong}"
+                before = self._indentations.get(key, (0, 0.0))[1]
+                doubtful = self._health[key].doubtful
+                depth = before if doubtful else meter.measure(frame.image)
+                self._indentations[key] = frame.sequence, depth
+        depths = [self._indentations[k][1] if k in self._indentations else 0.0 for k in ft.TACTILE]
+        return np.array(depths), fault
 
     def problem(self) -> str:
         """Return the cameras' own reports of problems."""

@@ -18,9 +18,10 @@ from touchgoal.control.deployment.hand import require_empty_hand
 from touchgoal.control.interfaces import Camera, TactileSensor
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.safety.fingertip_health import FingertipHealth
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.control.sensors.exchanged import fingertips_exchanged
-from touchgoal.control.tactile.contact import contact_strength
+from touchgoal.control.tactile.contact import coarse, contact_strength, threshold_for
 from touchgoal.control.tactile.image_guard import check_untouched
 from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.markers.tracker import find_markers, without_markers
@@ -35,6 +36,7 @@ _TOUCHED_COUNTS = 12.0
 _WATCH_SECONDS = 1.0  # s for which cameras are watched
 # mm between tools by nominal and by the controller's kinematics: a UR's own calibration makes 1 to 2
 _CALIBRATED, _OTHER_ARM = 1.0, 10.0
+_WATCH_INTERVAL = 0.05  # s between two looks at the fingertips
 _MAX_REST_FORCE = 7.5  # N measured at rest above which the arm does not begin
 # Bytes/s: both fingertips and two cameras of 256 x 256 take 17e6 as they come, and at most as much
 # again once the run is saved.
@@ -56,7 +58,7 @@ def preflight(
     `episodes` is the folder that the run records into; `count_episodes` counts those already in it,
     with a UserError if it cannot be continued.
     """
-    rates = measure_rates(connection)
+    rates, tips_seen = watch_cameras(connection)
     checks: list[tuple[str, Callable[[], str]]] = [
         ("client", lambda: check_client(cell)),
         ("arm", lambda: _arm(connection, safety)),
@@ -69,7 +71,7 @@ def preflight(
     if tips := cell.fingertips:
         nominal |= dict.fromkeys(ft.TACTILE, tips.rate or find_sensor(cell.sensor).frame_rate)
     for key, camera in connection.cameras.items():
-        check = partial(_camera, camera, rates[key], nominal[key])
+        check = partial(_camera, camera, rates[key], nominal[key], tips_seen.get(key, []))
         checks.append((key.removeprefix(ft.IMAGE_PREFIX), check))
     if tips and tips.sensor_files:
         checks.append(("fingertips", lambda: _fingertips(connection)))
@@ -83,13 +85,21 @@ def preflight(
     return [_run_check(*check) for check in checks]
 
 
-def measure_rates(connection: CellConnection) -> dict[str, float]:
-    """Return the rate of each camera (Hz), by the connection's clock."""
-    begin = connection.clock.now()
+def watch_cameras(connection: CellConnection) -> tuple[dict[str, float], dict[str, list[Image]]]:
+    """Return the rate of each camera (Hz), by the connection's clock, and each fingertip's frames."""
+    clock, begin = connection.clock, connection.clock.now()
     before = _sequences(connection)
-    connection.clock.wait(begin + _WATCH_SECONDS)
-    after, seconds = _sequences(connection), connection.clock.now() - begin
-    return {key: (after[key] - before[key]) / seconds for key in after}
+    found: dict[str, dict[int, Image]] = {}
+    while clock.now() < begin + _WATCH_SECONDS - 1e-9:
+        clock.wait(min(clock.now() + _WATCH_INTERVAL, begin + _WATCH_SECONDS))
+        for key, camera in connection.cameras.items():
+            if isinstance(camera, TactileSensor):
+                with suppress(Exception):  # of any driver; the camera's own check says so
+                    frame = camera.read()
+                    found.setdefault(key, {})[frame.sequence] = frame.image
+    after, seconds = _sequences(connection), clock.now() - begin
+    rates = {key: (after[key] - before[key]) / seconds for key in after}
+    return rates, {key: list(frames.values()) for key, frames in found.items()}
 
 
 def _sequences(connection: CellConnection) -> dict[str, int]:
@@ -191,12 +201,20 @@ def _gripper(cell: CellConfig, connection: CellConnection) -> str:
     return f"{1e3 * reading.width:.0f} mm wide{holds}"
 
 
-def _camera(camera: Camera, rate: float, nominal: float) -> str:
+def _camera(camera: Camera, rate: float, nominal: float, frames: list[Image]) -> str:
     if camera.problem:
         raise UserError(camera.problem)
     untouched = ""
     if isinstance(camera, TactileSensor):
-        check_untouched(camera.read().image, camera.model, "it")
+        health, sensor = FingertipHealth(camera.model), camera.model
+        for wrong in (health.update(frame) for frame in frames):
+            if wrong:
+                raise UserError(wrong)
+        frames = frames or [camera.read().image]
+        middle = np.median(frames, axis=0).astype(np.uint8)
+        if wrong := coarse(threshold_for(np.stack(frames), middle)):
+            raise UserError(wrong)
+        check_untouched(camera.read().image, sensor, "it")
         frame, background = _fingertip(camera)
         # A unit differs from its sensor file; a contact differs by far more.
         strength = float(contact_strength(frame[None], background)[0])

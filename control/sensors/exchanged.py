@@ -1,14 +1,21 @@
 """Exchanged cameras and fingertips, found by their images."""
 
+import time
+from collections.abc import Callable, Mapping
+
 import cv2
 import numpy as np
 
 from touchgoal.control.arrays import Image
-from touchgoal.control.tactile.background import local_change
+from touchgoal.control.interfaces import TactileSensor
+from touchgoal.control.tactile.background import Background, local_change
+from touchgoal.control.tactile.contact import ContactDetector
+from touchgoal.runtime.errors import UserError
 
 _CLEARLY = 1.5  # factor by which a fingertip must be more like the other's sensor file
 _SMALL = 32  # px of a side at which images of cameras are compared
 _MOVED = 2.5  # counts: median change of an image whose camera has moved, at least
+_LOOKS, _LOOK = 600, 0.05  # times that a fingertip is looked at for a touch, and s between two
 _TIMES = 3.0  # factor by which the other camera's image must change less
 
 
@@ -23,6 +30,31 @@ def fingertips_exchanged(frames: tuple[Image, Image], backgrounds: tuple[Image, 
         for frame in frames
     ]
     return all(_CLEARLY * unlike[side][1 - side] < unlike[side][side] for side in (0, 1))
+
+
+def probe_fingertips(
+    tips: Mapping[str, TactileSensor],
+    say: Callable[[str], None] = print,
+    wait: Callable[[float], None] = time.sleep,
+) -> None:
+    """Ask for a touch of each fingertip by its name; UserError if another one answers, or none."""
+    detectors = {n: ContactDetector(Background(tip.read().image[None])) for n, tip in tips.items()}
+    for asked in tips:
+        say(f"touch the {asked} fingertip, then let go")
+        felt = False
+        for _ in range(_LOOKS):
+            wait(_LOOK)
+            touched = [n for n, tip in tips.items() if detectors[n].update(tip.read().image)]
+            if touched and asked not in touched:
+                raise UserError(
+                    f"the {touched[0]} fingertip felt the touch of the {asked} one: exchange them in "
+                    "the cell file, or the two sensors"
+                )
+            if felt and not touched:
+                break
+            felt = felt or asked in touched
+        else:
+            raise UserError(f"the {asked} fingertip felt no touch: check its cable and its gel")
 
 
 def cameras_exchanged(front: tuple[Image, Image], wrist: tuple[Image, Image]) -> bool:

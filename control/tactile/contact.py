@@ -11,6 +11,9 @@ THRESHOLD = 1.2  # counts; noise of 1 count has a strength of 0.3, at most 0.45
 # Threshold of a noisy sensor per usual strength of its untouched frames. On 409 clips of a real
 # Mini (PhysiCLeAR) 2.5 finds every touch; at 2 and below, untouched frames count as touches.
 _SPARE = 2.5
+# Threshold (counts) above which light touches are missed: JPEG of quality 50 has 7 to 9, of 70 at most
+# 5.4, 60 clips of a real Mini (PhysiCLeAR) 2.3 to 6.7.
+_COARSE = 7.0
 _LEARNING_FRAMES = 10  # 0.4 s of a 25 Hz sensor
 _FEWEST_FRAMES = 3  # of these that differ
 _LEARNING_QUANTILE = 0.3
@@ -86,3 +89,13 @@ def threshold_for(untouched: Images, background: Image) -> float:
     Compressed streams have a strength of 1 to 2. Fewer than half of the frames may be in contact.
     """
     return max(THRESHOLD, _SPARE * float(np.median(contact_strength(untouched, background))))
+
+
+def coarse(threshold: float) -> str:
+    """Return what is wrong with images that need so high a contact threshold; "" if nothing."""
+    if threshold <= _COARSE:
+        return ""
+    return (
+        f"its images are so compressed or noisy that contact needs {threshold:.1f} counts, above "
+        f"{_COARSE:g} light touches are missed: send or store them at JPEG quality 90 or without loss"
+    )

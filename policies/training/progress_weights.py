@@ -45,7 +45,8 @@ def progress_weights(
 ) -> Float32[np.ndarray, " n"]:
     """Return a weight in [0, 1] for every frame of some episodes, one after the other.
 
-    The weight follows from the progress in the next `ahead` frames, or until the episode's end.
+    The weight follows from the progress in the next `ahead` frames, or until the episode's end. An
+    episode's last frame has none, because no action follows it. UserError: nothing makes progress.
     """
     later = [np.minimum(np.arange(len(p)) + ahead, len(p) - 1) for p in progress]
     gain = np.concatenate([p[to] - p for p, to in zip(progress, later, strict=True)])
@@ -53,4 +54,9 @@ def progress_weights(
     weights = np.clip((gain - mean + 2 * spread) / (4 * spread), 0, 1)
     weights[gain > _IN_FULL] = 1
     weights[gain < 0] = 0
+    weights[np.cumsum([len(p) for p in progress]) - 1] = 0
+    if not weights.any():
+        raise UserError(
+            "no frame of --data makes progress: leave out --progress, or check its goal"
+        )
     return weights.astype(np.float32)

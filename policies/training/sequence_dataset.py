@@ -10,6 +10,7 @@ from torch import Tensor
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.batch_noise import BatchNoise
+from touchgoal.episodes.action_meaning import ActionMeaning, joint_changes
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.policies.network import ObservationBatch, PolicyConfig
@@ -45,6 +46,7 @@ def load_recordings(
     embedder: TouchEmbedder | None,
     workers: Workers = 1,
     skip: Sequence[int] | None = None,
+    meaning: ActionMeaning = "change",
 ) -> Recordings:
     """Read episodes, and embed those that have no embedding yet; a kill loses those in progress.
 
@@ -56,7 +58,8 @@ def load_recordings(
     embedded = embed_episodes(episodes, chosen, embedder, workers) if embedder else None
     images = ImageEmbedder(config.images) if config.images else None
     maps = embed_episodes(episodes, chosen, images, workers) if images else []
-    keys = [*config.proprioception, ft.ACTION, *[ft.TRUTH_PAD_WRENCH] * config.reads_wrench]
+    keys = [*config.proprioception, ft.STATE, ft.ACTION]
+    keys += [ft.TRUTH_PAD_WRENCH] * config.reads_wrench
     touch, state, actions, differences, wrench, tcp = [], [], [], [], [], []
     for n, i in enumerate(track(chosen, "reading", "episode")):
         frames = episodes.read(i, keys).frames
@@ -64,7 +67,7 @@ def load_recordings(
             frames[ft.WRENCH] = tare(frames[ft.WRENCH], frames[ft.WRENCH][0])
         start = skip[n] if skip else 0
         state.append(np.concatenate([frames[key][start:] for key in config.proprioception], 1))
-        actions.append(frames[ft.ACTION][start:])
+        actions.append(joint_changes(frames[ft.ACTION], frames[ft.STATE], meaning)[start:])
         if images:
             tcp.append(frames[ft.TCP_POSE][start:])
         if config.reads_wrench:
@@ -116,13 +119,7 @@ def _check(
             f"{episodes.root} runs at {episodes.fps} Hz, the policy at {config.control_hz}: set "
             "control_hz to the episodes' rate"
         )
-    for key in (ft.STATE, ft.ACTION):
-        shape = episodes.features.get(key, {"shape": [0]})["shape"]
-        if tuple(shape) != ft.FEATURES[key].shape:
-            raise UserError(
-                f"{episodes.root} is of another arm: its {key} is {shape[0]} wide; policies read and "
-                f"command an FR3 ({key}: {ft.FEATURES[key].meaning})"
-            )
+    check_arm(episodes)
     if missing := set(config.proprioception) - set(episodes.features):
         raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy reads")
     if config.reads_wrench and ft.TRUTH_PAD_WRENCH not in episodes.features:
@@ -140,6 +137,17 @@ def _check(
         raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy reads")
     if embedder or config.end_to_end:
         check_fingertips(episodes, chosen)
+
+
+def check_arm(episodes: EpisodeSet) -> None:
+    """Raise UserError unless state and action of a set are an FR3's."""
+    for key in (ft.STATE, ft.ACTION):
+        shape = episodes.features.get(key, {"shape": [0]})["shape"]
+        if tuple(shape) != ft.FEATURES[key].shape:
+            raise UserError(
+                f"{episodes.root} is of another arm: its {key} is {shape[0]} wide; policies read and "
+                f"command an FR3 ({key}: {ft.FEATURES[key].meaning})"
+            )
 
 
 class SequenceDataset:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.episodes.action_meaning import ActionMeaning, joint_changes
 from touchgoal.episodes.faults import leave_out_faulty
 from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.schema import Episode
@@ -59,12 +60,13 @@ def choose_episodes(
     return chosen
 
 
-def leading_pause(episode: Episode) -> int:
+def leading_pause(episode: Episode, meaning: ActionMeaning = "change") -> int:
     """Return how many frames pass before an episode's arm or gripper moves or is commanded to.
 
     An episode without motion has no start to trim to: 0. Needs state and action.
     """
-    state, action = episode.frames[ft.STATE], episode.frames[ft.ACTION]
+    state = episode.frames[ft.STATE]
+    action = joint_changes(episode.frames[ft.ACTION], state, meaning)
     joints = action.shape[1] - 1
     commanded = np.abs(np.cumsum(action[:, :joints], axis=0)).max(1) > _JOINT_MOTION
     commanded |= np.abs(action[:, -1] - action[0, -1]) > _WIDTH_MOTION
@@ -74,9 +76,11 @@ def leading_pause(episode: Episode) -> int:
     return int(moving[0]) if len(moving) else 0
 
 
-def find_pauses(episodes: EpisodeSet, rows: Sequence[int]) -> list[int]:
+def find_pauses(
+    episodes: EpisodeSet, rows: Sequence[int], meaning: ActionMeaning = "change"
+) -> list[int]:
     """Return how many frames of each episode pass before arm or gripper first move."""
-    return [leading_pause(episodes.read(i, [ft.STATE, ft.ACTION])) for i in rows]
+    return [leading_pause(episodes.read(i, [ft.STATE, ft.ACTION]), meaning) for i in rows]
 
 
 def report_pauses(pauses: Sequence[int], fps: int, trimmed: bool) -> None:

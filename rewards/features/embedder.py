@@ -12,13 +12,13 @@ from jaxtyping import Float32, UInt8
 
 from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT, WRENCH
 from touchgoal.control.tactile.background import first_steady, untouched_frames
-from touchgoal.control.tactile.image_guard import check_unpressed, check_untouched
+from touchgoal.control.tactile.image_guard import check_unpressed
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import MapTowers, OfflineTowers, Towers
 from touchgoal.episodes.schema import Episode, MetaValue, is_camera
-from touchgoal.episodes.touches import touch_background
+from touchgoal.episodes.touches import check_touch, touch_background
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
 from touchgoal.rewards.features.contact_reading import ContactReader, ContactSearch
 from touchgoal.rewards.features.embedded import (
@@ -164,9 +164,8 @@ class EpisodeEmbedder:
         for side in sides:
             first_steady(first[side], f"{side} of {source}")
             if sensor is not None:
-                background = touch_background(first[side])
-                check_untouched(background, sensor, f"{side} of {source}")
-                check_unpressed(background, sensor, f"{side} of {source}")
+                check_touch(first[side], sensor, f"{side} of {source}")
+                check_unpressed(touch_background(first[side]), sensor, f"{side} of {source}")
         about = EmbeddedEpisode(
             {}, self.made_with if sides else self._images_with, source, fps, sides
         )

@@ -46,6 +46,7 @@ class Facts:
     peaks: dict[str, list[int]]  # frames of the bumps of each cost curve
     shown: list[int]  # frames that the images show
     columns: list[str]  # names of the values per frame
+    goal_untouched: bool = False  # whether it touches, and its goal of touch does not
 
     def metrics(self) -> dict[str, CurveMetrics]:
         """Return the metrics of each cost curve."""
@@ -116,8 +117,17 @@ def record_of(curves: Curves, trajectory: Trajectory, thumbnails: Thumbnails) ->
         peaks={n: find_peaks(c, metrics[n].eps).tolist() for n, c in curves.costs.items()},
         shown=thumbnails.shown,
         columns=list(columns),
+        goal_untouched=_goal_untouched(curves),
     )
     return Record(facts, columns, thumbnails.sheets())
+
+
+def _goal_untouched(curves: Curves) -> bool:
+    """Return whether touch is near its goal before the first contact, and far from it later."""
+    touch, first = curves.raw.get("tactile"), curves.contact.frame
+    if touch is None or not first or "tactile" not in curves.goal:
+        return False
+    return bool(np.median(touch[:first]) < touch[first:].max() / 2)
 
 
 def columns_of(curves: Curves) -> dict[str, Float[np.ndarray, " n"]]:

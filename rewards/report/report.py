@@ -48,8 +48,10 @@ def report_all(
     provenance: Mapping[str, Any],
     threshold: SuccessThreshold | None = None,
     audit: str = "",
-) -> None:
+) -> str:
     """Write the reports of all records: metrics, tables for LeRobot, pages; print the tables.
+
+    Return why the reward is not to be trained on, "" if nothing speaks against it.
 
     Args:
         threshold: what counts as success, if that is known.
@@ -73,6 +75,12 @@ def report_all(
     if not facts[0].normalised:
         print(f"no {PROGRESS}: raw distances are no progress; normalise them (fit-normalizer)")
     print(f"page: {page}")
+    if not (bare := sum(one.goal_untouched for one in facts)):
+        return ""
+    return (
+        f"in {bare} of {len(facts)} the goal is untouched though the trajectory touches: a grasp raises "
+        "the cost of touch; choose a goal in contact, and do not train on this reward"
+    )
 
 
 def report_json(curves: Curves, provenance: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,11 +1,13 @@
 """Map of a function over items, on the cores of this machine or of a Ray cluster."""
 
+import sys
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 from touchgoal.runtime.errors import UserError
@@ -51,11 +53,25 @@ def _map_on_processes(
                     done, deaths = done + 1, 0
                     yield result
         except BrokenProcessPool as error:
+            if script := _unguarded_script():
+                raise UserError(
+                    f"workers run {script} anew and end in it: put what it does under "
+                    'if __name__ == "__main__":'
+                ) from error
             deaths += 1
             if deaths > RETRIES:
                 raise UserError(
                     f"worker processes died {deaths} times: if memory is short, use fewer --workers"
                 ) from error
+
+
+def _unguarded_script() -> str:
+    """Return the path of a running script without a main guard, which workers import; else ""."""
+    main = sys.modules["__main__"]
+    path = getattr(main, "__file__", None)
+    if path is None or main.__spec__ is not None or not Path(path).is_file():
+        return ""
+    return "" if "__name__" in Path(path).read_text(errors="replace") else path
 
 
 def _map_on_ray(
