@@ -313,13 +313,14 @@ def assign_goals(
                 f"goal '{spec}' applies to {' and '.join(spec.modalities)}, but this source has "
                 f"{' and '.join(available)} only; leave the goal out"
             )
-        free = [m for m in wanted if m not in taken]
+        free: list[Modality] = [m for m in wanted if m not in taken]
         if not free:
             raise UserError(
                 f"goal '{spec}' is never used: '{taken[wanted[0]]}' before it already applies to "
                 f"{' and '.join(wanted)}; put it first or leave it out"
             )
-        taken.update({modality: spec for modality in free})
+        for modality in free:
+            taken[modality] = spec
     return {name: taken[name] for name in MODALITIES if name in taken}
 
 

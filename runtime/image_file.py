@@ -31,8 +31,8 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
 
 def decode_image(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
     """Decode an image file's bytes, as `read_image`; `name` is for the message."""
+    alpha = False
     try:
-        alpha = False
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data)) as opened:  # reads the header alone
