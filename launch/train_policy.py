@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, cast
 
 from touchgoal.encoders.training.options import TrainingOptions
-from touchgoal.episodes.action_meaning import ActionMeaning
 from touchgoal.policies.config import (
     ActionRepresentation,
     ArmState,
@@ -15,6 +14,7 @@ from touchgoal.policies.config import (
     TouchInput,
     TrainConfig,
 )
+from touchgoal.policies.training.action_meaning import ActionMeaning
 from touchgoal.runtime.option_types import (
     RARE,
     Count,
@@ -173,12 +173,12 @@ def main(config: Config) -> None:
     from touchgoal.encoders.pretrained import find_encoder
     from touchgoal.encoders.training.run import check_run, open_sets, open_training, recipe
     from touchgoal.encoders.training.trainer import is_first_process
-    from touchgoal.episodes.action_meaning import check_actions
     from touchgoal.episodes.keys import parse_keys
     from touchgoal.policies.checkpoint import ESTIMATOR, TOUCH
     from touchgoal.policies.perception.frozen_touch import load_touch
     from touchgoal.policies.perception.state_estimation import load_pose_estimator
     from touchgoal.policies.training import training_data
+    from touchgoal.policies.training.action_meaning import check_actions
     from touchgoal.policies.training.model_selection import copy_parts, score, select
     from touchgoal.policies.training.sequence_dataset import (
         SequenceDataset,

@@ -8,10 +8,10 @@ import pytest
 
 from touchgoal.control import features as ft
 from touchgoal.control.motion.arm_models import FR3_ARM
-from touchgoal.episodes.action_meaning import ActionMeaning, check_actions, joint_changes
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.train_policy import Config, main
+from touchgoal.policies.training.action_meaning import ActionMeaning, check_actions, joint_changes
 from touchgoal.runtime.errors import UserError
 
 HOME = np.array(FR3_ARM.home)
@@ -59,7 +59,7 @@ KINDS = {
     "velocities": (scaled(20), "change", "are joint velocities: store the joint change"),
     "gripper 0..1": (scaled(1, 12.5), "change", "gripper goes from 0.03 to 1, which is no width"),
     "nonsense": (
-        lambda s, a: a + np.array([3, -2, 1, 4, 3, 5, 2, 0]),
+        lambda s, a: a + np.array([3, -2, 1, 4, 3, 5, 2, 0], np.float32),
         "change",
         "are no joint change",
     ),

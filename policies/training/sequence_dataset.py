@@ -10,7 +10,6 @@ from torch import Tensor
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.batch_noise import BatchNoise
-from touchgoal.episodes.action_meaning import ActionMeaning, joint_changes
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.policies.network import ObservationBatch, PolicyConfig
@@ -19,6 +18,7 @@ from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.sight.frozen_images import ImageEmbedder
 from touchgoal.policies.sight.key_pose import HOLD_SECONDS, key_poses
+from touchgoal.policies.training.action_meaning import ActionMeaning, joint_changes
 from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import Workers

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.action_meaning import ActionMeaning, joint_changes
 from touchgoal.episodes.faults import leave_out_faulty
 from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.policies.training.action_meaning import ActionMeaning, joint_changes
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import TASKS
 
