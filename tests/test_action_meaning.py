@@ -40,11 +40,11 @@ def relative(state: np.ndarray, action: np.ndarray) -> np.ndarray:
 
 
 def scaled(factor: float, width: float = 1.0) -> Callable:
-    return lambda state, action: action * np.array([factor] * 7 + [width])
+    return lambda state, action: action * np.array([factor] * 7 + [width], np.float64)
 
 
 def degrees(state: np.ndarray, action: np.ndarray) -> np.ndarray:
-    return absolute(state, action) * np.array([np.rad2deg(1)] * 7 + [1])
+    return absolute(state, action) * np.append(np.full(7, np.rad2deg(1)), 1)
 
 
 KINDS = {
@@ -55,7 +55,7 @@ KINDS = {
     "relative, converted": (relative, "relative", ""),
     "ours taken for absolute": (lambda s, a: a, "absolute", "per tick: leave out --actions"),
     "degrees": (degrees, "change", "positions in degrees: store radians"),
-    "changes in degrees": (scaled(np.rad2deg(1)), "change", "tick in degrees: store radians"),
+    "changes in degrees": (scaled(180 / np.pi), "change", "tick in degrees: store radians"),
     "velocities": (scaled(20), "change", "are joint velocities: store the joint change"),
     "gripper 0..1": (scaled(1, 12.5), "change", "gripper goes from 0.03 to 1, which is no width"),
     "nonsense": (
