@@ -59,7 +59,7 @@ KINDS = {
     "velocities": (scaled(20), "change", "are joint velocities: store the joint change"),
     "gripper 0..1": (scaled(1, 12.5), "change", "gripper goes from 0.03 to 1, which is no width"),
     "nonsense": (
-        lambda s, a: a + np.array([3, -2, 1, 4, 3, 5, 2, 0], np.float32),
+        lambda s, a: a + np.array([3.0, -2.0, 1.0, 4.0, 3.0, 5.0, 2.0, 0.0]),
         "change",
         "are no joint change",
     ),
@@ -71,7 +71,7 @@ def write_set(root: Path, seeds: range, kind: str) -> EpisodeSet:
     for seed in seeds:
         state, action = demonstration(seed)
         stored = KINDS[kind][0](state, action).astype(np.float32)
-        pose = np.tile(np.float32([0.4, 0, 0.3, 1, 0, 0, 0]), (len(state), 1))
+        pose = np.full((len(state), 7), 0.5, np.float32)
         frames = {ft.STATE: state, ft.TCP_POSE: pose, ft.ACTION: stored}
         writer.append(Episode(frames, "lift", {"success": True, "task": "lift"}))
     writer.close()
