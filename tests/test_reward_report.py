@@ -28,7 +28,7 @@ from touchgoal.rewards.measure import Measurement, embed_here, write_skipped
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.record import Record, load_facts
 from touchgoal.rewards.report.report import report_all
-from touchgoal.rewards.report.tables import outcome_table
+from touchgoal.rewards.report.tables import COLUMNS, ends_table, metrics_table, outcome_table
 from touchgoal.rewards.reward import Reward
 from touchgoal.rewards.sources import trajectory
 from touchgoal.rewards.sources.episode_trajectories import default_goals
@@ -172,6 +172,24 @@ def test_outcomes_are_compared_by_goals_of_others_alone() -> None:
     row = next(line.split() for line in table.splitlines() if line.startswith("fused"))
     assert row[1:] == ["0.20", "0.55", "0.75"]
     assert "none: every goal" in outcome_table([own])
+
+
+def test_printed_tables_are_short_and_name_the_objects() -> None:
+    """The fused curve and four others, a legend of what is shown, each trajectory's last cost."""
+    metrics = dict.fromkeys((field for field, _ in COLUMNS.values()), 0.5) | {
+        "contact_lag": None,
+        "t_drop_50": 3,
+        "peaks": 1,
+    }
+    measured = {name: metrics for name in (*"abcdef", "fused")}
+    some = [replace(facts("success", 0.1, name), object=name, measured=measured) for name in "xy"]
+    some = [replace(one, goal={"text": "text:a hard ball"}) for one in some]
+    table = metrics_table(some, most=4)
+    assert [line.split()[0] for line in table.splitlines()[2:8]] == ["curve", "fused", *"abcd"]
+    assert "2 more curves" in table and "lag" not in table and "undefined" not in table
+    ends = ends_table(some)
+    assert "x           x" in ends and "describe some of them only" in ends
+    assert "describe" not in ends_table([replace(one, object="cup") for one in some])
 
 
 def test_tables_for_lerobot(episodes: Path, tmp_path: Path) -> None:

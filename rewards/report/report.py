@@ -15,7 +15,13 @@ from touchgoal.rewards.report.frame_table import PROGRESS, write_frames, write_p
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.plot import plot
 from touchgoal.rewards.report.record import columns_of, load_facts
-from touchgoal.rewards.report.tables import metrics_table, outcome_table, success_table
+from touchgoal.rewards.report.tables import (
+    MOST_CURVES,
+    ends_table,
+    metrics_table,
+    outcome_table,
+    success_table,
+)
 from touchgoal.rewards.success import SuccessThreshold
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.json_file import write_json
@@ -61,14 +67,14 @@ def report_all(
     write_frames(records, facts, out, provenance)
     if facts[0].normalised:
         write_progress(records, out)
-    tables = [metrics_table(facts)]
-    if any(one.outcome for one in facts):
+    tables = [metrics_table(facts, most=MOST_CURVES), ends_table(facts)]
+    if any(one.success is False for one in facts):
         tables.append(outcome_table(facts))
     if threshold is not None:
         tables.append(success_table(facts, threshold, out))
     if audit:
         tables.append(audit)
-    page = write_pages(records, facts, out, tables[1:])
+    page = write_pages(records, facts, out, tables[2:])
     print("\n\n".join(tables))
     if not facts[0].normalised:
         print(f"no {PROGRESS}: raw distances are no progress; normalise them (fit-normalizer)")
