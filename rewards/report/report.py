@@ -28,11 +28,16 @@ from touchgoal.runtime.json_file import write_json
 
 
 def write_report(
-    curves: Curves, folder: Path, name: str, provenance: Mapping[str, Any], with_plot: bool = True
+    curves: Curves,
+    folder: Path,
+    name: str,
+    provenance: Mapping[str, Any],
+    with_plot: bool = True,
+    about: str = "",
 ) -> dict[str, Path]:
     """Write NAME.csv, NAME.json and, on request, NAME.png, each atomically; return the paths by kind.
 
-    The JSON also holds what the curves were made with (encoder, towers, command).
+    The plot's title ends with `about`. The JSON also holds what the curves were made with (encoder, towers, command).
     """
     contents = {
         "csv": curves_csv(curves).encode(),
@@ -40,7 +45,7 @@ def write_report(
     }
     if with_plot:
         png = io.BytesIO()
-        FigureCanvasAgg(plot(curves)).print_png(png, metadata={"Software": None})
+        FigureCanvasAgg(plot(curves, about=about)).print_png(png, metadata={"Software": None})
         contents["png"] = png.getvalue()
     paths = {kind: folder / f"{name}.{kind}" for kind in contents}
     for kind, path in paths.items():
