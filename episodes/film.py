@@ -1,7 +1,8 @@
 """Films of simulated episodes: images, a curve beside them, a caption below."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import cycle
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,15 @@ from touchgoal.sim_envs.scene.filming import TICKS_PER_IMAGE
 BLACK = "#000000"
 COLORS = ("#0072B2", "#D55E00", "#CC79A7", BLACK, "#009E73", "#56B4E9", "#E69F00", "#7A5C2E")
 """Okabe and Ito, "Color universal design" (2008), distinct for colour-blind readers, and a brown."""
+_OWN = {
+    "image": 0,
+    "tactile": 1,
+    "text": 2,
+    "words": 2,
+    "fused": 3,
+    "image+tactile": 4,
+    "image+text": 5,
+}
 _DPI = 100
 _PANEL = 320  # px, width of the curves
 _CAPTION = 24  # px, height of the caption
@@ -55,6 +65,12 @@ def write_film(
     write_video(path, np.stack(frames), control_hz / TICKS_PER_IMAGE)
 
 
+def curve_colors(names: Iterable[str]) -> dict[str, str]:
+    """Return each curve's colour, in films, plots and pages; a plain distance has one of its own."""
+    cycled = cycle(k for k, color in enumerate(COLORS) if color != BLACK)
+    return {name: COLORS[_OWN[name] if name in _OWN else next(cycled)] for name in names}
+
+
 def caption_of(episode: Episode) -> str:
     """Return object or wire, outcome and seed: "glass_ball: success, seed 7"."""
     meta = episode.meta
@@ -69,8 +85,10 @@ def _draw_panel(
     """Return an image of all curves up to `end` (s), and the box of its axes (px)."""
     figure = Figure(figsize=(_PANEL / _DPI, height / _DPI), dpi=_DPI)
     axes = figure.add_axes((0.16, 0.17, 0.8, 0.66))
-    for (name, values), color in zip(curves.items(), COLORS, strict=False):
-        axes.plot(np.arange(len(values)) / control_hz, values, color=color, label=name, lw=1.5)
+    colors = curve_colors(curves)
+    for name, values in curves.items():
+        time = np.arange(len(values)) / control_hz
+        axes.plot(time, values, color=colors[name], label=name, lw=1.5)
     axes.set_xlim(0, end)
     axes.set_xlabel("time (s)", fontsize=7, labelpad=1)
     axes.set_ylabel(label, fontsize=7, labelpad=2)

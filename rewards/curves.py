@@ -123,6 +123,12 @@ def main_curve(names: Iterable[str]) -> str:
     return (fused or listed)[0]
 
 
+def main_first(names: Iterable[str]) -> list[str]:
+    """Return each name once, the main curve first."""
+    listed = list(dict.fromkeys(names))
+    return sorted(listed, key=main_curve(listed).__ne__)
+
+
 def reference_levels(names: Iterable[str], normalised: bool) -> list[tuple[float, str]]:
     """Return reference levels of a cost axis with their labels; none for raw distances."""
     if FUSED in names:

@@ -111,7 +111,9 @@ class Measurement:
         (embedded, thumbnails), name = result, trajectory.name
         reward = self._rewards[name]
         curves = reward.curves(embedded)
-        write_report(curves, self._out, name, reward.provenance(), name in self._plotted)
+        meta = trajectory.meta
+        about = ", ".join(str(meta[k]) for k in ("object", "outcome") if meta.get(k))
+        write_report(curves, self._out, name, reward.provenance(), name in self._plotted, about)
         path = self._paths[name]
         for stale in path.parent.glob(f"{name}.*.npz"):
             stale.unlink()

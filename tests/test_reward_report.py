@@ -19,6 +19,7 @@ from test_success import facts
 from toy_towers import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
+from touchgoal.episodes.film import curve_colors
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
@@ -27,10 +28,12 @@ from touchgoal.rewards.curves import Contact, Curves
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import Bank, OwnFrame
 from touchgoal.rewards.measure import Measurement, embed_here, write_skipped
+from touchgoal.rewards.metrics import measure_curve
 from touchgoal.rewards.report.page import write_pages
+from touchgoal.rewards.report.plot import line_styles, plot
 from touchgoal.rewards.report.record import Record, load_facts, record_of
 from touchgoal.rewards.report.report import report_all
-from touchgoal.rewards.report.tables import outcome_table
+from touchgoal.rewards.report.tables import ends_table, metrics_table, outcome_table
 from touchgoal.rewards.report.thumbnails import Thumbnails
 from touchgoal.rewards.reward import Reward
 from touchgoal.rewards.sources import trajectory
@@ -204,6 +207,33 @@ def test_outcomes_are_compared_by_goals_of_others_alone() -> None:
     assert "none: every goal" in outcome_table([own])
 
 
+def test_printed_tables_are_short_and_name_the_objects() -> None:
+    """The fused curve and four others, a legend of what is shown, each trajectory's last cost."""
+    metrics = measure_curve(np.linspace(1, 0, 40), None).as_dict()
+    measured = {name: metrics for name in (*"abcdef", "fused")}
+    some = [replace(facts("success", 0.1, name), object=name, measured=measured) for name in "xy"]
+    some = [replace(one, goal={"text": "text:a hard ball"}) for one in some]
+    table = metrics_table(some, most=4)
+    assert [line.split()[0] for line in table.splitlines()[2:8]] == ["curve", "fused", *"abcd"]
+    assert "2 more curves" in table and "lag" not in table and "undefined" not in table
+    ends = ends_table(some)
+    assert (
+        ends.splitlines()[2].split()[:3] == ["x", "x", "0.00"]
+        and "describe some of them only" in ends
+    )
+    assert "describe" not in ends_table([replace(one, object="cup") for one in some])
+
+
+def test_a_curve_has_one_colour_and_a_lone_one_is_solid() -> None:
+    alone, beside = line_styles(["image"]), line_styles(["image", "tactile", "image+tactile"])
+    colors = curve_colors(["fused", "front", "image"])  # of films, too
+    assert alone["image"]["color"] == beside["image"]["color"] == colors["image"]
+    curve = {"image": np.linspace(1, 0, 9)}
+    figure = plot(Curves("a", {}, 20.0, Contact(None, "no touch"), curve, {}), about="cup, drop")
+    assert figure.texts[0].get_text() == "a · cup, drop"
+    assert alone["image"]["linestyle"] == "-" and colors["fused"] == "#000000"
+
+
 def test_tables_for_lerobot(episodes: Path, tmp_path: Path) -> None:
     record = Record.load(measure(episodes, tmp_path).records[1])
     table = pq.read_table(tmp_path / "frames.parquet")
@@ -251,6 +281,7 @@ def pages(episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ca
 def test_page_holds_everything(pages: Callable[..., Path]) -> None:
     page = pages(100)
     data = data_of(page)
+    assert data["colors"] == curve_colors(["image"]) and data["unit"] == "cosine distance to goal"
     assert addresses(page) == [] and "&lt;b&gt;" in page.read_text()
     assert [e["outcome"] for e in data["episodes"]] == ["success", "success", "drop", "success"]
     first = data["episodes"][0]

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from touchgoal.episodes.film import curve_colors
 from touchgoal.rewards.curves import main_curve, reference_levels
 from touchgoal.rewards.report.record import Facts, Record
 from touchgoal.rewards.report.tables import COLUMNS
@@ -108,6 +109,8 @@ def _content(facts: Sequence[Facts], episodes: Sequence[Mapping[str, Any]]) -> d
     return {
         "curves": names,
         "main": main_curve(names),
+        "colors": curve_colors(names),
+        "unit": facts[0].unit,
         "levels": reference_levels(names, facts[0].normalised),
         "columns": [*used, {"key": "frames", "label": "frames", "digits": 0}, *metrics],
         "episodes": episodes,

@@ -7,21 +7,20 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from touchgoal.episodes.film import BLACK, COLORS
+from touchgoal.episodes.film import curve_colors
 from touchgoal.rewards.curves import FUSED, GAMMA, Curves, main_curve, reference_levels
 
 _DASHES = ((0, (5, 2)), (0, (1.5, 1.5)), (0, (5, 1.5, 1.5, 1.5)), "-", (0, (3, 1)), (0, (8, 2)))
-_SINGLE = tuple(color for color in COLORS if color != BLACK)
 _SIZE = (12.0, 10.0)  # inches, at 100 pixels an inch
 _PANELS = ((0.53, 0.345), (0.275, 0.17), (0.06, 0.15))  # bottom and height of each panel
 _LABEL_GAP = 0.06  # least distance between two curve labels, share of the first panel's height
 
 
-def plot(curves: Curves, gamma: float = GAMMA) -> Figure:
+def plot(curves: Curves, gamma: float = GAMMA, about: str = "") -> Figure:
     """Return a figure of costs and rewards over time: `plot(curves).savefig("curves.png")`.
 
     The first contact and the reference levels are marked. With parts, the rewards are those of the
-    fused cost.
+    fused cost. `about`, such as object and outcome, follows the title.
     """
     costs = curves.costs
     main = main_curve(costs)
@@ -56,28 +55,31 @@ def plot(curves: Curves, gamma: float = GAMMA) -> Figure:
             axes.tick_params(labelbottom=k == 0)
     figure.axes[-1].set_xlabel("time (s)", fontsize=12)
     goals = " and ".join(dict.fromkeys(curves.goal.values()))
-    heading, goal = _elide_middle(curves.source, 85), _elide_middle(f"goal: {goals}", 125)
+    heading, goal = (
+        _elide_middle(" · ".join(filter(None, (curves.source, about))), 85),
+        _elide_middle(f"goal: {goals}", 125),
+    )
     figure.text(0.095, 0.95, heading, fontsize=15, fontweight="bold", parse_math=False)
     figure.text(0.095, 0.915, goal, fontsize=12, color="0.35", parse_math=False)
     return figure
 
 
 def line_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return colour, dashes and width of each curve; the main one is a thick black line.
+    """Return colour, dashes and width of each curve; the main one is thick, and a lone one solid.
 
     Colours are for the colour-blind, too; the dashes distinguish them in grey.
     """
-    main = main_curve(names) if len(names) > 1 else ""
+    main, colors = main_curve(names), curve_colors(names)
     single = [name for name in names if name != main]
     styles: dict[str, dict[str, Any]] = {
         name: {
-            "color": _SINGLE[k % len(_SINGLE)],
+            "color": colors[name],
             "linestyle": _DASHES[k % len(_DASHES)],
             "linewidth": 1.8,
         }
         for k, name in enumerate(single)
     }
-    return styles | {main: {"color": BLACK, "linestyle": "-", "linewidth": 2.6}}
+    return styles | {main: {"color": colors[main], "linestyle": "-", "linewidth": 2.6}}
 
 
 def _frame_axes(axes: Axes, label: str, end: float) -> None:

@@ -15,18 +15,29 @@ from touchgoal.rewards.report.frame_table import PROGRESS, write_frames, write_p
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.plot import plot
 from touchgoal.rewards.report.record import columns_of, load_facts
-from touchgoal.rewards.report.tables import metrics_table, outcome_table, success_table
+from touchgoal.rewards.report.tables import (
+    MOST_CURVES,
+    ends_table,
+    metrics_table,
+    outcome_table,
+    success_table,
+)
 from touchgoal.rewards.success import SuccessThreshold
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.json_file import write_json
 
 
 def write_report(
-    curves: Curves, folder: Path, name: str, provenance: Mapping[str, Any], with_plot: bool = True
+    curves: Curves,
+    folder: Path,
+    name: str,
+    provenance: Mapping[str, Any],
+    with_plot: bool = True,
+    about: str = "",
 ) -> dict[str, Path]:
     """Write NAME.csv, NAME.json and, on request, NAME.png, each atomically; return the paths by kind.
 
-    The JSON also holds what the curves were made with (encoder, towers, command).
+    The plot's title ends with `about`. The JSON also holds what the curves were made with (encoder, towers, command).
     """
     contents = {
         "csv": curves_csv(curves).encode(),
@@ -34,7 +45,7 @@ def write_report(
     }
     if with_plot:
         png = io.BytesIO()
-        FigureCanvasAgg(plot(curves)).print_png(png, metadata={"Software": None})
+        FigureCanvasAgg(plot(curves, about=about)).print_png(png, metadata={"Software": None})
         contents["png"] = png.getvalue()
     paths = {kind: folder / f"{name}.{kind}" for kind in contents}
     for kind, path in paths.items():
@@ -63,14 +74,14 @@ def report_all(
     write_frames(records, facts, out, provenance)
     if facts[0].normalised:
         write_progress(records, out)
-    tables = [metrics_table(facts)]
-    if any(one.outcome for one in facts):
+    tables = [metrics_table(facts, most=MOST_CURVES), ends_table(facts)]
+    if any(one.success is False for one in facts):
         tables.append(outcome_table(facts))
     if threshold is not None:
         tables.append(success_table(facts, threshold, out))
     if audit:
         tables.append(audit)
-    page = write_pages(records, facts, out, tables[1:])
+    page = write_pages(records, facts, out, tables[2:])
     print("\n\n".join(tables))
     if not facts[0].normalised:
         print(f"no {PROGRESS}: raw distances are no progress; normalise them (fit-normalizer)")

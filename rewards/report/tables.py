@@ -6,7 +6,7 @@ from io import StringIO
 from pathlib import Path
 from statistics import mean, median_low
 
-from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.curves import Curves, main_first
 from touchgoal.rewards.metrics import auc
 from touchgoal.rewards.report.record import Facts
 from touchgoal.rewards.success import SuccessThreshold
@@ -15,6 +15,7 @@ from touchgoal.runtime.errors import UserError
 
 SUCCESSES = "successes.csv"
 _LISTED = 20  # trajectories that are printed by name
+MOST_CURVES = 4  # beside the main one, of a printed table
 _TITLE = "last cost by outcome, goals from other trajectories"
 
 COLUMNS = {
@@ -43,27 +44,52 @@ COLUMNS = {
 """Header -> field of `CurveMetrics`, and line of the legend."""
 
 
-def metrics_table(curves: Sequence[Curves] | Sequence[Facts], legend: bool = True) -> str:
+def metrics_table(
+    curves: Sequence[Curves] | Sequence[Facts], legend: bool = True, most: int | None = None
+) -> str:
     """Return a table with a row for each kind of curve, and the meaning of its columns.
 
     Costs and correlations are means over the episodes; frames and counts are medians (the lower one
     of two), so that they stay whole. A value that some episodes lack is followed by the number of
-    those that have it; a dash stands for one that all lack.
+    those that have it; a dash stands for one that all lack. The main curve is first; of more than
+    `most` others, the first ones are shown.
     """
     metrics = [c.metrics() for c in curves]
-    names = list(dict.fromkeys(name for m in metrics for name in m))
+    names = main_first(name for m in metrics for name in m)
+    shown = names if most is None else names[: most + 1]
     rows = [["curve", *COLUMNS]]
-    for name in names:
+    for name in shown:
         some = [m[name] for m in metrics if name in m]
         rows.append([name, *(_cell([getattr(m, f) for m in some]) for f, _ in COLUMNS.values())])
+    kept = [k for k, cells in enumerate(zip(*rows, strict=True)) if {*cells[1:]} != {"-"}]
+    rows = [[row[k] for k in kept] for row in rows]
     n = len(curves)
     lines = [f"{n} {'trajectory' if n == 1 else 'trajectories'}; cost: {curves[0].unit}"]
     if n > 1:
         lines.append("costs and correlations are means, frames and counts are medians")
     lines += aligned(rows)
+    if len(shown) < len(names):
+        lines.append(f"and {len(names) - len(shown)} more curves: see the page")
     if legend:
-        lines += [f"  {header:<10}{legend}" for header, (_, legend) in COLUMNS.items()]
-        lines.append("  -         undefined: the cost does not fall, or there is no contact")
+        lines += [f"  {header:<10}{COLUMNS[header][1]}" for header in rows[0][1:]]
+        if any("-" in row for row in rows):
+            lines.append("  -         undefined: the cost does not fall, or there is no contact")
+    return "\n".join(lines)
+
+
+def ends_table(facts: Sequence[Facts]) -> str:
+    """Return a table, its title first: object and last cost of the main curves of each trajectory."""
+    curves = main_first(name for f in facts for name in f.measured)[: MOST_CURVES + 1]
+    rows = [["trajectory", "object", *curves]]
+    for f in facts[:_LISTED]:
+        ends = (f"{f.measured[c]['end']:.2f}" if c in f.measured else "-" for c in curves)
+        rows.append([f.name, f.object or "-", *ends])
+    lines = ["last cost by trajectory", *aligned(rows)]
+    if len(facts) > _LISTED:
+        lines.append(f"and {len(facts) - _LISTED} more: see the page")
+    sentences = {g for f in facts for g in f.goal.values() if g.startswith("text:")}
+    if sentences and len({f.object for f in facts}) > 1:
+        lines.append("several objects: the sentence may describe some of them only")
     return "\n".join(lines)
 
 

@@ -1,7 +1,7 @@
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
-const COLORS = 10, MARGIN = { left: 46, right: 10, top: 12, bottom: 26 };
+const MARGIN = { left: 62, right: 10, top: 12, bottom: 26 };
 const hidden = new Set();
 let chosen = null, frame = 0, order = data.episodes.slice(), sortedBy = null, descending = false;
 
@@ -15,7 +15,7 @@ function make(tag, attributes, parent, text) {
 }
 
 function colorOf(name) {
-  return name === data.main ? "var(--main)" : `var(--c${data.curves.filter((n) => n !== data.main).indexOf(name) % COLORS})`;
+  return data.colors[name] === "#000000" ? "var(--main)" : data.colors[name];
 }
 
 function number(value, digits = 2) {
@@ -95,6 +95,8 @@ function drawChart() {
     make("line", { class: "grid", x1: MARGIN.left, x2: s.width - MARGIN.right, y1: s.y(v), y2: s.y(v) }, chart);
     make("text", { x: MARGIN.left - 7, y: s.y(v) + 4, "text-anchor": "end" }, chart, String(v));
   }
+  const middle = (s.height - MARGIN.bottom + MARGIN.top) / 2;
+  make("text", { x: 12, y: middle, transform: `rotate(-90 12 ${middle})`, "text-anchor": "middle" }, chart, data.unit);
   const seconds = (chosen.frames - 1) / chosen.fps;
   for (const t of steps(0, seconds, Math.min(8, s.width / 80))) {
     make("text", { x: s.x(t * chosen.fps), y: s.height - 8, "text-anchor": "middle" }, chart, `${t} s`);
