@@ -147,7 +147,8 @@ def test_what_the_franka_is_told(monkeypatch: Patch) -> None:
     state, set_ = robot.state, {}
     state.q = state.q_d = state.dq = state.tau_ext_hat_filtered = HOME
     state.O_F_ext_hat_K, state.robot_mode = np.ones(6), library.RobotMode.Idle
-    state.O_T_EE.__mul__.return_value.translation = np.zeros(3)
+    contact = state.O_T_EE.__mul__.return_value
+    contact.translation = contact.__mul__.return_value.translation = np.zeros(3)
     state.time.to_sec.return_value = 0.0
     for name in ("velocity", "acceleration", "jerk"):
         limit = getattr(robot, f"joint_{name}_limit")
@@ -179,6 +180,7 @@ def rtde(monkeypatch: Patch) -> SimpleNamespace:
     ):
         getattr(receive, name).return_value = [0.0] * 6
     receive.getTimestamp.return_value = 0.0
+    control.getForwardKinematics.return_value = [0.0] * 6
     receive.isProtectiveStopped.return_value = receive.isEmergencyStopped.return_value = False
     use(
         monkeypatch,

@@ -12,7 +12,16 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from both_sides import complaint, sides
-from fake_cell import SIM, FakeArm, FakeCamera, FakeCell, FakeLoadCell, KeptTicks, write_cell_file
+from fake_cell import (
+    SIM,
+    FakeArm,
+    FakeCamera,
+    FakeCell,
+    FakeFingertip,
+    FakeLoadCell,
+    KeptTicks,
+    write_cell_file,
+)
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
@@ -29,7 +38,6 @@ from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.trajectories import joint_move
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
-from touchgoal.control.sensors.tactile_camera import NO_CROP, TactileCamera
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 
@@ -91,8 +99,12 @@ def hold(cell: FakeCell, width: float, grasped: bool = False) -> None:
     cell.gripper.reading = replace(cell.gripper.reading, width=width, grasped=grasped)
 
 
-def fingertip(cell: FakeCell) -> TactileCamera:
-    return TactileCamera(FakeCamera(cell.clock, GEL), GELSIGHT_MINI, NO_CROP)
+class Fingertip(FakeFingertip):
+    """An untouched one whose image flickers by a count from tick to tick."""
+
+    def read(self) -> Frame:
+        sequence = round(1000 * self.clock.time)
+        return Frame(self.image + np.uint8(sequence // 50 % 2), sequence, self.clock.time)
 
 
 def hand(width: float, asked: float, seconds: float = 2.0, creeping: float = 0.0) -> Ending:
@@ -104,7 +116,7 @@ def hand(width: float, asked: float, seconds: float = 2.0, creeping: float = 0.0
 
 def untouched(seconds: float) -> Ending:
     cell = FakeCell()
-    cell.cameras = {key: fingertip(cell) for key in ft.TACTILE}
+    cell.cameras = {key: Fingertip(cell.clock) for key in ft.TACTILE}
     return cell.run(lambda tick: hold(cell, 0.04, tick >= 3), seconds=seconds)
 
 
@@ -163,7 +175,7 @@ def test_a_gel_pressed_too_deep_is_let_go_unless_the_object_would_fall(
 ) -> None:
     """It may be in the air if it was held before the first tick."""
     cell, depth = FakeCell(), np.zeros(2)
-    monkeypatch.setattr(ObservationReader, "_indentation", lambda *_: depth)
+    monkeypatch.setattr(ObservationReader, "_indentation", lambda *_: (depth, ""))
     hold(cell, width, held_since == 0)
 
     def each(tick: int) -> None:
@@ -227,6 +239,7 @@ def test_a_twin_below_95_percent_of_real_time_is_named(pace: float, tick: int, s
         ("wrench", 7.49, 7.51, "at rest"),
         ("wrench", 7.49, np.nan, "near a singularity"),
         ("late", 0.25, 0.26, "0.26 s old"),
+        ("tcp", 9.99e-3, 10.01e-3, "is it no FR3?"),  # m from where the controller has it
         ("rate", 24.0, 23.0, "23.0 images a second instead of 30"),
         ("counts", 11.9, 12.1, "looks touched (12 counts)"),
         ("disk", 1.551e9, 1.549e9, "make room for 1.6 GB"),  # 500 MB, and 35 MB for each of 30 s
@@ -241,10 +254,13 @@ def test_what_preflight_lets_pass(
     for value, refused in ((inside, False), (outside, True)):
         given = {"rate": 30.0, "late": 0.0, "counts": 0.0, "disk": 1e12} | {what: value}
         cell = with_arm(late=given["late"])
+        if what == "tcp":
+            there, _ = KINEMATICS.forward(HOME)
+            cell.arm.reading = replace(cell.arm.reading, tcp=there + value * E[1, :3])
         if what in ("velocity", "wrench"):
             changed = value * np.eye(len(getattr(cell.arm.reading, what)))[2]
             cell.arm.reading = replace(cell.arm.reading, **{what: changed})
-        cell.cameras = {key: fingertip(cell) for key in ft.TACTILE}
+        cell.cameras = {key: Fingertip(cell.clock) for key in ft.TACTILE}
         cell.cameras[ft.FRONT] = Paced(cell.clock, GEL, given["rate"])
         strength = np.array([given["counts"]])
         monkeypatch.setattr(preflight, "contact_strength", lambda *_, found=strength: found)
@@ -415,3 +431,12 @@ def test_how_long_a_plan_is_waited_for_and_that_a_hung_one_ages(monkeypatch: Pat
     monkeypatch.setattr(late._condition, "wait_for", lambda *_: False)
     monkeypatch.setattr(late._thread, "start", lambda: None)
     assert "no plan in 20 s" in complaint(late.start, {})
+
+
+@sides((0.99e-3, 1.01e-3))
+def test_a_calibration_of_the_arms_own_is_said_from_a_millimetre_on(
+    value: float, beyond: bool
+) -> None:
+    cell, (there, _) = FakeCell(), KINEMATICS.forward(HOME)
+    cell.arm.reading = replace(cell.arm.reading, tcp=there + value * E[0, :3])
+    assert ("own calibration is not used" in preflight._kinematics(cell.connection())) == beyond

@@ -20,7 +20,10 @@ from touchgoal.control.safety.action_filter import (
     SafetyState,
     Watchdogs,
 )
+from touchgoal.control.safety.fingertip_health import FingertipHealth, image_fault
 from touchgoal.control.safety.limits import Box
+from touchgoal.control.tactile.sensor_calibration import load
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 
 FR3, UR5E = ActionFilter(robots.FR3, 20), ActionFilter(robots.UR5E, 20)
 HOME, E = robots.FR3.arm.home, np.eye(7)
@@ -184,3 +187,22 @@ def test_a_cells_own_ages_stop_the_arm_at_five_times_as_much(tmp_path: Path) -> 
     own = replace(cell, safety=replace(cell.safety, observation_age=0.2, state_age=0.04))
     assert cell_watchdogs(own).observation == Deadline(0.2, 1.0)
     assert cell_watchdogs(own).state == Deadline(0.04, 0.2)
+
+
+def test_which_images_of_a_fingertip_are_faulty_and_how_many_are_borne() -> None:
+    """0.3 of the brightness, 245 counts, 12 of noise; two bad images, six unchanged ones."""
+    usual = load(GELSIGHT_MINI.sensor_file).background
+
+    def fault(*columns: float) -> str:
+        row = np.resize(np.array(columns, np.uint8), 320)[:, None]
+        return image_fault(np.tile(row, (240, 1, 3)), GELSIGHT_MINI)
+
+    dark = 0.3 * usual.mean()
+    assert not any((fault(np.ceil(dark)), fault(245), fault(100, 106)))
+    assert "black" in fault(np.floor(dark)) and "overexposed" in fault(246)
+    assert "noise (14 counts" in fault(100, 107)
+    dies, freezes = FingertipHealth(GELSIGHT_MINI), FingertipHealth(GELSIGHT_MINI)
+    said = [dies.update(np.full_like(usual, count)) for count in range(3)]
+    assert [bool(word) for word in said] == [False, False, True]
+    said = [freezes.update(usual) for _ in range(7)]
+    assert [bool(word) for word in said] == [False] * 6 + [True]
