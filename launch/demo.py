@@ -65,7 +65,7 @@ def main(config: Config) -> None:
     held = until_release(episode)
     EpisodeWriter(out / "episodes", hz).append(held)
     curves = reward.curves(reward.embedder.embed_episode(held, hz, str(held.meta["object"])))
-    write_report(curves, out, "curves", reward.provenance(), about=config.env.objects[0])
+    write_report(curves, out, "curves", reward.provenance())
     shown = {FUSED: curves.parts[FUSED], **curves.plain}
     write_film(out / "episode.mp4", images, episode, hz, shown, "distance to goal")
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
