@@ -99,7 +99,7 @@ def test_what_a_poor_cable_brings_is_counted(line: tuple[int, str]) -> None:
         if cut > 200:
             seen.add(cell.read().force)
     until(lambda: cell.read().force == 1200.0)
-    assert seen <= {1000.0 + k for k in range(200)}
+    assert seen <= {1000.0 + k for k in range(201)}
     wrong = [text for text in stream.split(b"\n")[:-1] if parse(text.strip(), config) is None]
     assert cell.read().rejected == len(wrong) > 20
     cell.close()

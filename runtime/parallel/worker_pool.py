@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 
@@ -59,7 +59,8 @@ class WorkerPool(ProcessPoolExecutor):
             worker.kill()
             worker.join()
         if results is not None:
-            results._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
+            with suppress(OSError):  # the pool's own thread may close it at the same time
+                results._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
 
     def _workers(self) -> list[BaseProcess]:
         """Return the workers; none before the first task and after the end."""
