@@ -100,13 +100,21 @@ class SensorRandomization:
     azimuth: Annotated[NotNegative, Field(le=180)] = 15.0  # largest turn of each light, degrees
     blur: Fraction = 0.3  # largest relative change of the gel's smoothing of an imprint
     pixel_pitch: bool = True  # draw the millimetres per pixel from the sensor model's range
+    defocus: Fraction = 1.0  # share of the model's largest blur by the lens, from which it is drawn
     markers: Fraction = (
         0.1  # largest shift of dots, share of their spacing, and change of their size
     )
 
 
 NO_RANDOMIZATION = SensorRandomization(
-    gain=0.0, offset=0.0, pattern=0.0, azimuth=0.0, blur=0.0, pixel_pitch=False, markers=0.0
+    gain=0.0,
+    offset=0.0,
+    pattern=0.0,
+    azimuth=0.0,
+    blur=0.0,
+    pixel_pitch=False,
+    defocus=0.0,
+    markers=0.0,
 )
 
 

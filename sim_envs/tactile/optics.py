@@ -134,6 +134,9 @@ def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.
         instance.illumination,
         change,
     )
+    if instance.defocus:
+        for plane in change:
+            cv2.GaussianBlur(plane, (0, 0), instance.defocus / step, dst=plane)
     return change
 
 
