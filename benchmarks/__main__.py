@@ -46,6 +46,10 @@ BENCHMARKS = {
     "real-touch": ("real_touch.videos", "encoders on labelled videos of real touch"),
     "real-force": ("real_touch.forces", "force and contact on real grasps with a load cell"),
     "real-markers": ("real_touch.markers", "gel dots of real images against another tracker"),
+    "touch-spectrum": (
+        "real_touch.touch_spectrum",
+        "sharpness of simulated touch beside real sensors",
+    ),
     "tactile-realism": ("real_touch.tactile_realism", "simulated against real presses of a ball"),
     "deploy": ("deployment.deploy", "success through the environment, in process and on the wire"),
     "faults": ("deployment.faults", "what a deployment does under every fault"),

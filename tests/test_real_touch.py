@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.published_touch.force_grasps import read_force_grasps
-from benchmarks.real_touch import forces, markers
+from benchmarks.real_touch import forces, markers, touch_spectrum
 from benchmarks.real_touch.embedders import find_embedder
 from benchmarks.real_touch.property_probe import (
     adapted_nearest_is_same,
@@ -82,6 +82,30 @@ def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
         return float(within / np.square(means[0] - means[1]).sum())
 
     assert apart(adapted) < 0.7 * apart(load_encoder("gelsight_mini"))
+
+
+def test_the_spectrum_of_touches(tmp_path: Path) -> None:
+    """A wave's power is in its own band; waves pressed on a DIGIT and simulated presses are read."""
+    for i, band in enumerate(touch_spectrum.BANDS):  # 4.62: where a difference of Gaussians peaks
+        wave = np.repeat(np.sin(2 * np.pi * np.arange(400) / (4.62 * band))[None, :, None], 200, 0)
+        change = np.repeat(wave, 3, 2).astype(np.float32)
+        middle = np.zeros((200, 400), bool)
+        middle[60:140, 80:320] = True
+        assert touch_spectrum.band_powers(change, middle).argmax() == i
+    rng = np.random.default_rng(0)
+    for thing in range(4):
+        for take in range(3):
+            image = 100 + rng.normal(0, 1, (320, 240, 3))
+            top, left = rng.integers(10, 150, 2)
+            image[top : top + 60, left : left + 60] += 40 * np.sin(np.arange(60) / 3)[:, None]
+            path = tmp_path / f"touch/thing{thing}/{take}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path.with_suffix(".jpg")), image)
+    real = touch_spectrum.read_digit(tmp_path)
+    assert len(real.of(tuned=True).powers) == len(real.of(tuned=False).powers) == 6
+    assert (real.powers.argmax(1) == 2).all()
+    made = touch_spectrum.simulated_touches("digit", surfaces=3, seed=0)
+    assert len(made.powers) and (made.powers.argmax(1) >= 2).all()  # that unit is out of focus
 
 
 def test_sentences_are_judged_on_objects_never_seen() -> None:

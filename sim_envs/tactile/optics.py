@@ -135,8 +135,8 @@ def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.
         change,
     )
     if instance.defocus:
-        for plane in change:
-            cv2.GaussianBlur(plane, (0, 0), instance.defocus / step, dst=plane)
+        sigma = instance.defocus / step
+        return np.stack([cv2.GaussianBlur(change[c], (0, 0), sigma) for c in range(3)])
     return change
 
 
