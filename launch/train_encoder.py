@@ -206,7 +206,6 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
 
 
 def _fit_to_surfaces(config: Surfaces) -> None:
-    from touchgoal.control.tactile.sensor_calibration import load
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.encoders.pretrained import save
     from touchgoal.encoders.whitening.simulated_surfaces import WhiteningConfig, train
@@ -214,10 +213,9 @@ def _fit_to_surfaces(config: Surfaces) -> None:
     from touchgoal.runtime.run_folder import open_run
 
     sensor = find_sensor(config.sensor)
-    name = load(sensor.sensor_file).sensor
     out = open_run(config.out, "train-encoder", config)
     whitening = WhiteningConfig(config.surfaces, config.presses_per_surface, config.seed)
-    encoder = train(sensor, name, whitening)
+    encoder = train(sensor, whitening)
     source = {
         "data": "simulated: random surfaces pressed",
         "simulated_sensor": config.sensor,

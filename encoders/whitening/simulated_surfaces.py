@@ -44,9 +44,9 @@ class WhiteningConfig:
     seed: int = 0
 
 
-def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEncoder:
-    """Return an encoder for the sensor called `name`, fitted to simulated touch."""
-    encoder = PooledEncoder(PooledEncoderConfig.for_sensor(name))
+def train(sensor: SensorModel, config: WhiteningConfig) -> PooledEncoder:
+    """Return an encoder for a sensor, fitted to simulated touch."""
+    encoder = PooledEncoder(PooledEncoderConfig.for_sensor(sensor.name))
     d = encoder.config.features
     total, square, within = np.zeros(d), np.zeros((d, d)), np.zeros((d, d))
     count, step = config.surfaces * config.presses, max(1, _BATCH // config.presses)
@@ -115,7 +115,7 @@ def _unit(sensor: SensorModel, rng: np.random.Generator) -> SensorInstance:
 
 def visible_press(surface: Surface, unit: SensorInstance, rng: np.random.Generator) -> Press:
     """Return a random press that can be seen, or the last of a few."""
-    rest = render_untouched(unit, rng)
+    rest = unit.with_dots(render_untouched(unit, rng))
     frame = rest
     for _ in range(_TRIES):
         frame = press(surface, random_pose(rng), unit, rng)

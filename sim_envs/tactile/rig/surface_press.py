@@ -94,8 +94,9 @@ def _body(surface: Surface, x: np.ndarray, y: np.ndarray) -> Float32[np.ndarray,
 def press(
     surface: Surface, pose: SurfacePose, instance: SensorInstance, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Render one sensor's image of a press, RGB."""
+    """Render one sensor's image of a press, RGB; without shear its dots hardly move."""
     _, h, w = instance.background.shape
     pitch = instance.pixel_pitch
     raw = overlap(surface, pose, (h, w), pitch)
-    return render(deform(raw, pitch, instance.calibration.blur_sigmas), instance, rng)
+    deformed = deform(raw, pitch, instance.calibration.blur_sigmas)
+    return instance.with_dots(render(deformed, instance, rng))
