@@ -2,6 +2,7 @@
 
 import os
 import shlex
+from collections.abc import Iterator
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import get_args
@@ -78,9 +79,16 @@ def main(config: Config) -> None:
 
 
 def _changed_options(config: Config) -> str:
-    """Return the options of the task that differ from its own, as typed; nested ones stay away."""
+    """Return the options of the task that differ from its own, as typed."""
+    return " ".join(_changed(config.env, ENVS[config.task]))
+
+
+def _changed(given: object, default: object, above: str = "") -> Iterator[str]:
     from touchgoal.policies.by_name import typed_option
 
-    given, default = vars(config.env), vars(ENVS[config.task])
-    changed = {name: value for name, value in given.items() if value != default[name]}
-    return " ".join(typed_option(*one) for one in changed.items() if not is_dataclass(one[1]))
+    for name, value in vars(given).items():
+        usual = vars(default)[name]
+        if is_dataclass(value):
+            yield from _changed(value, usual, f"{above}{name}.")
+        elif value != usual:
+            yield typed_option(above + name, value)
