@@ -2,7 +2,6 @@
 
 import os
 import shlex
-from collections.abc import Iterator
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import get_args
@@ -66,7 +65,7 @@ def main(config: Config) -> None:
     if config.task not in get_args(SimulatedTask):
         return
     cell = "sim" if config.task == "pick-place" else "sim_maze"
-    if changed := _changed_options(config):
+    if changed := _changed_options(config.env, ENVS[config.task]):
         print(
             f"next, serve this task: touchgoal twin --task {config.task} {changed} --out runs/twin"
         )
@@ -78,17 +77,14 @@ def main(config: Config) -> None:
     print(f"{when}, by the control loop that also drives a real arm: {command}")
 
 
-def _changed_options(config: Config) -> str:
-    """Return the options of the task that differ from its own, as typed."""
-    return " ".join(_changed(config.env, ENVS[config.task]))
-
-
-def _changed(given: object, default: object, above: str = "") -> Iterator[str]:
+def _changed_options(given: object, default: object, above: str = "") -> str:
+    """Return the options that differ from the default ones, as typed."""
     from touchgoal.policies.by_name import typed_option
 
-    for name, value in vars(given).items():
-        usual = vars(default)[name]
-        if is_dataclass(value):
-            yield from _changed(value, usual, f"{above}{name}.")
-        elif value != usual:
-            yield typed_option(above + name, value)
+    return " ".join(
+        _changed_options(value, usual, f"{above}{name}.")
+        if is_dataclass(value)
+        else typed_option(above + name, value)
+        for (name, value), usual in zip(vars(given).items(), vars(default).values(), strict=True)
+        if value != usual
+    )

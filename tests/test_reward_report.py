@@ -19,7 +19,6 @@ from test_success import facts
 from toy_towers import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
-from touchgoal.episodes.film import curve_colors
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
@@ -30,7 +29,7 @@ from touchgoal.rewards.goals import Bank, OwnFrame
 from touchgoal.rewards.measure import Measurement, embed_here, write_skipped
 from touchgoal.rewards.metrics import measure_curve
 from touchgoal.rewards.report.page import write_pages
-from touchgoal.rewards.report.plot import line_styles, plot
+from touchgoal.rewards.report.plot import curve_colors, line_styles, plot
 from touchgoal.rewards.report.record import Record, load_facts, record_of
 from touchgoal.rewards.report.report import report_all
 from touchgoal.rewards.report.tables import ends_table, metrics_table, outcome_table
@@ -230,7 +229,8 @@ def test_a_curve_has_one_colour_and_a_lone_one_is_solid() -> None:
     assert alone["image"]["color"] == beside["image"]["color"] == colors["image"]
     curve = {"image": np.linspace(1, 0, 9)}
     figure = plot(Curves("a", {}, 20.0, Contact(None, "no touch"), curve, {}), about="cup, drop")
-    assert figure.texts[0].get_text() == "a · cup, drop"
+    assert [text.get_text() for text in figure.texts] == ["a · cup, drop", "image · goal: "]
+    assert figure.axes[0].get_position().x1 > 0.95  # beside it there are no names
     assert alone["image"]["linestyle"] == "-" and colors["fused"] == "#000000"
 
 
@@ -281,13 +281,16 @@ def pages(episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ca
 def test_page_holds_everything(pages: Callable[..., Path]) -> None:
     page = pages(100)
     data = data_of(page)
-    assert data["colors"] == curve_colors(["image"]) and data["unit"] == "cosine distance to goal"
+    assert (
+        data["styles"]["image"]["color"] == curve_colors(["image"])["image"]
+        and data["unit"] == "cosine distance to goal"
+    )
     assert addresses(page) == [] and "&lt;b&gt;" in page.read_text()
     assert [e["outcome"] for e in data["episodes"]] == ["success", "success", "drop", "success"]
     first = data["episodes"][0]
     assert len(first["curves"]["image"]) == 12 and first["shown"] == list(range(12))
     sheet = first["sheets"]["front"]
-    assert (sheet["columns"], sheet["width"], sheet["height"]) == (8, 96, 96)
+    assert (sheet["columns"], sheet["width"], sheet["height"]) == (8, 32, 32)
     index = pages(3)
     names = ["report.html", "report_001.html", "report_002.html"]
     assert addresses(index) == names
