@@ -53,4 +53,4 @@ film = Image.fromarray(frames[2 * len(frames) // 3])
 save("demo", film.resize((2 * film.width, 2 * film.height)), list(FILMED))
 report = runs / "curves" / "report.html"
 data = json.loads(report.read_text().split('id="data">')[1].split("</script>")[0])
-save("reward_page", photograph(report), data["curves"])
+save("reward_page", photograph(report).quantize(256), data["curves"])
