@@ -16,7 +16,15 @@ from touchgoal.rewards.report.plot import curve_colors
 from touchgoal.launch.demo import FILMED
 
 WIDTH, HEIGHT = 1120, 1400  # px of the browser's window
-ACT = "show(60); byId('meanings').getBoundingClientRect().top"  # scrub to 3 s; end of the image
+ACT = """
+const key = (name) => document.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));
+key("ArrowDown");
+const second = chosen.name;
+key("ArrowUp");
+show(61);
+key("ArrowLeft");  // at 3 s
+[chosen.name, second, frame, document.querySelectorAll("#chart path:not(.peak)").length, byId("meanings").getBoundingClientRect().top]
+"""
 
 
 def save(name: str, image: Image.Image, curves: list[str]) -> None:
@@ -26,7 +34,7 @@ def save(name: str, image: Image.Image, curves: list[str]) -> None:
 
 
 def photograph(page: Path) -> Image.Image:
-    """Return the page as a browser shows it, from its top to the end of the table."""
+    """Check that the page's keys work; return its image in a browser, to the end of the table."""
     app, view, taken = QApplication(sys.argv[:1]), QWebEngineView(), []
 
     def take(bottom: float) -> None:
@@ -36,11 +44,12 @@ def photograph(page: Path) -> Image.Image:
         taken[0] = taken[0].crop((0, 0, WIDTH, round(bottom)))
         app.quit()
 
-    def act(_: bool) -> None:
-        view.page().runJavaScript(ACT, lambda bottom: QTimer.singleShot(1000, lambda: take(bottom)))
+    def check(found: list) -> None:
+        assert found[:4] == ["episode_000", "episode_001", 60, len(data["curves"])], found
+        QTimer.singleShot(1000, lambda: take(found[4]))
 
     view.resize(WIDTH, HEIGHT)
-    view.loadFinished.connect(act)
+    view.loadFinished.connect(lambda _: view.page().runJavaScript(ACT, check))
     view.load(QUrl.fromLocalFile(str(page.resolve())))
     view.show()
     app.exec()
@@ -53,4 +62,4 @@ film = Image.fromarray(frames[2 * len(frames) // 3])
 save("demo", film.resize((2 * film.width, 2 * film.height)), list(FILMED))
 report = runs / "curves" / "report.html"
 data = json.loads(report.read_text().split('id="data">')[1].split("</script>")[0])
-save("reward_page", photograph(report).quantize(256), data["curves"])
+save("reward_page", photograph(report), data["curves"])

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,8 +37,7 @@ from touchgoal.episodes.media import write_video
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.demo import FILMED
 from touchgoal.launch.deploy import NOT_DONE
-from touchgoal.rewards.curves import FUSED
-from touchgoal.rewards.distance.parts import SMALLEST_UNIT, VALUE, WORDS
+from touchgoal.rewards.distance.parts import FUSED, SMALLEST_UNIT, VALUE, WORDS
 from touchgoal.rewards.report.plot import CURVES
 from touchgoal.runtime.parallel.worker_pool import one_core_workers
 
@@ -220,6 +220,7 @@ def test_snippets_run(
             c for c in TYPED if c.line.startswith("touchgoal collect-demos --episodes 4")
         )
         assert exit_status(recording.small) == 0
+    made: dict[str, Any] = {}
     for i, code in enumerate(snippets(page)):
         program = desk / f"snippet_{i}.py"
         program.write_text(code.replace("n_steps=512", "n_steps=16").replace("100_000", "16"))
