@@ -45,12 +45,11 @@ def write_film(
     if curves is None:
         curves, label = {"progress": episode.frames[TRUTH_PROGRESS][:, 0]}, "progress"
     ticks = max(map(len, curves.values())) - 1
-    end = ticks / control_hz
     panel, box = _draw_panel(images.shape[1], curves, control_hz, label, colors or {})
     frames = []
     for k, image in enumerate(images[: ticks // TICKS_PER_IMAGE + 1]):
         t = k * TICKS_PER_IMAGE / control_hz
-        beside = np.hstack([image, _up_to(panel, box, t / end)])
+        beside = np.hstack([image, _up_to(panel, box, k * TICKS_PER_IMAGE / ticks)])
         caption = _caption(beside.shape[1], caption_of(episode), f"{t:.1f} s")
         frames.append(np.vstack([beside, caption]))
     write_video(path, np.stack(frames), control_hz / TICKS_PER_IMAGE)

@@ -14,8 +14,7 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import FIXED, Seed, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig
 
-FILMED = ("fused", "front", "object", "words")
-"""Curves of the film, of all that the plot shows."""
+FILMED = ("fused", "front", "object", "words")  # of the curves that the plot shows
 
 if TYPE_CHECKING:
     from touchgoal.episodes.schema import Episode

@@ -89,8 +89,7 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
 def image(check: SensorCheck) -> UInt8[np.ndarray, "H W 3"]:
     """Draw one row per press: frame, simulated frame, change of each times 4 about grey, depth."""
     rows = [_row(press, check.background) for press in check.presses[:_SHOWN]]
-    names = _COLUMNS if rows else ("untouched",)
-    head = heading(names, check.background.shape[1])
+    head = heading(_COLUMNS if rows else ("untouched",), check.background.shape[1])
     return np.vstack([head, *(rows or [check.background])])
 
 

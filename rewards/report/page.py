@@ -29,7 +29,6 @@ PER_PAGE = 100  # trajectories
 _MOST_POINTS = 600  # of a curve in a page; a longer one is drawn by evenly spaced frames
 _FILES = Path(__file__).parent / "page_files"
 _WORDS = {"source": "trajectory", "object": "object", "outcome": "outcome"}
-
 _WHOLE = ("t_drop_50", "contact_lag", "peaks")  # metrics that count
 
 

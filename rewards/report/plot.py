@@ -36,14 +36,12 @@ def plot(curves: Curves, gamma: float = GAMMA, about: str = "") -> Figure:
     costs = curves.costs
     main = main_curve(costs)
     rewarded = [main] if main == FUSED else list(costs)
+    potential = curves.potential_rewards(gamma)
     unit = "distance to goal (cost, normalised)" if curves.normalised else f"cost: {curves.unit}"
     panels = (
         (unit, costs),
         ("state reward\n= -cost", {name: curves.rewards[name] for name in rewarded}),
-        (
-            f"potential-based reward\nγ = {gamma:g} per second",
-            {name: curves.potential_rewards(gamma)[name] for name in rewarded},
-        ),
+        (f"potential-based reward\nγ = {gamma:g} per second", {n: potential[n] for n in rewarded}),
     )
     fps, contact = curves.fps, curves.contact
     styles, several = line_styles(list(costs)), len(costs) > 1
@@ -58,7 +56,7 @@ def plot(curves: Curves, gamma: float = GAMMA, about: str = "") -> Figure:
         if k == 0:
             _frame_costs(axes, reference_levels(lines, bool(curves.normalised)))
         if contact.frame is not None:
-            name = f"contact ({contact.label_source})" if k == 0 else ""
+            name = f"contact ({contact.label_source})" * (k == 0)
             _mark_contact(axes, contact.frame / fps, name)
         axes.tick_params(labelbottom=k != 1)
         # In the last panel all curves end near 0: colours and dashes distinguish them.
@@ -86,13 +84,10 @@ def line_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     Colours are for the colour-blind, too; the dashes distinguish them in grey.
     """
     main, dashes = main_curve(names), cycle(_DASHES)
+    look = {n: ("-", 2.6) if n == main else (next(dashes), 1.8) for n in names}
+    fields = ("color", "linestyle", "linewidth")
     return {
-        name: {
-            "color": color,
-            "linestyle": "-" if name == main else next(dashes),
-            "linewidth": 2.6 if name == main else 1.8,
-        }
-        for name, color in curve_colors(names).items()
+        n: dict(zip(fields, (c, *look[n]), strict=True)) for n, c in curve_colors(names).items()
     }
 
 
@@ -125,11 +120,9 @@ def _frame_costs(axes: Axes, levels: Sequence[tuple[float, str]]) -> None:
 
 def _mark_contact(axes: Axes, time: float, name: str) -> None:
     axes.axvline(time, color="0.35", linewidth=1.2, linestyle=(0, (2, 3)), zorder=1)
-    if not name:
-        return
-    end, gap = ("right", -6) if time > 0.85 * axes.get_xlim()[1] else ("left", 6)
+    side, gap = ("right", -6) if time > 0.85 * axes.get_xlim()[1] else ("left", 6)
     at = {"xycoords": ("data", "axes fraction"), "xytext": (gap, -2), "textcoords": "offset points"}
-    axes.annotate(name, (time, 1), **at, ha=end, va="top", fontsize=11, color="0.35")
+    axes.annotate(name, (time, 1), **at, ha=side, va="top", fontsize=11, color="0.35")
 
 
 def _label_lines(
@@ -141,23 +134,18 @@ def _label_lines(
     """Name each line at its right end, outside the axes, moved apart where ends meet."""
     low, high = axes.get_ylim()
     names = sorted(values, key=lambda name: values[name][-1])
+    look: dict[str, Any] = {
+        "xycoords": "axes fraction",
+        "textcoords": "axes fraction",
+        "va": "center",
+    }
+    look |= {"annotation_clip": False, "fontsize": 12.5}
     arrow = {"arrowstyle": "-", "linewidth": 0.8, "shrinkA": 1, "relpos": (0, 0.5)}
     ends = np.array([(values[name][-1] - low) / (high - low) for name in names])
     for name, end, height in zip(names, ends, _spread_labels(ends, gap), strict=True):
-        color, width = styles[name]["color"], styles[name]["linewidth"]
-        axes.annotate(
-            name,
-            (1, end),
-            xycoords="axes fraction",
-            xytext=(1.045, height),
-            textcoords="axes fraction",
-            va="center",
-            fontsize=12.5,
-            fontweight="bold" if width > 2 else "normal",
-            color=color,
-            annotation_clip=False,
-            arrowprops=arrow | {"color": color},
-        )
+        color, weight = styles[name]["color"], "bold" if styles[name]["linewidth"] > 2 else "normal"
+        text, line = {"color": color, "fontweight": weight, **look}, {"color": color, **arrow}
+        axes.annotate(name, (1, end), xytext=(1.045, height), arrowprops=line, **text)
 
 
 def _spread_labels(heights: np.ndarray, gap: float) -> np.ndarray:

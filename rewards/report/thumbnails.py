@@ -2,7 +2,8 @@
 
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -37,19 +38,17 @@ class Thumbnails:
         start = 0
         for chunk in chunks:
             rows = [t - start for t in self.planned if start <= t < start + len(chunk)]
-            self._add({key: chunk.frames[key][rows] for key in filter(is_image, chunk.frames)})
+            self.add(replace(chunk, frames={k: v[rows] for k, v in chunk.frames.items()}))
             start += len(chunk)
             yield chunk
 
     def add(self, planned: Episode) -> None:
-        """Add the planned frames, where the trajectory is not read as a whole."""
-        self._add({key: planned.frames[key] for key in filter(is_image, planned.frames)})
-
-    def _add(self, frames: Mapping[str, UInt8[np.ndarray, "n h w 3"]]) -> None:
-        height = _LONE_HEIGHT if len(frames) == 1 else _HEIGHT
-        for key, images in frames.items():
-            name = key.removeprefix(IMAGE_PREFIX)
-            self._images.setdefault(name, []).extend(_shrunk(image, height) for image in images)
+        """Add planned frames; only where the trajectory is not read as a whole, all of them at once."""
+        keys = list(filter(is_image, planned.frames))
+        height = _LONE_HEIGHT if len(keys) == 1 else _HEIGHT
+        for key in keys:
+            small = [_shrunk(image, height) for image in planned.frames[key]]
+            self._images.setdefault(key.removeprefix(IMAGE_PREFIX), []).extend(small)
 
     def sheets(self) -> dict[str, UInt8[np.ndarray, " bytes"]]:
         """Return a JPEG of each camera and fingertip: its frames in rows of 8, from the top left."""
