@@ -188,7 +188,7 @@ def test_check_sensor_says_what_is_off(
     assert "lock the exposure" in printed and "record-presses" in printed
     assert "under a weight of 19.6 N: multiply" in printed
     drawn = cv2.imread(str(tmp_path / "out" / "check.png"))
-    assert drawn is not None and drawn.shape == (3 * 240, 5 * 320, 3)
+    assert drawn is not None and drawn.shape == (24 + 3 * 240, 5 * 320, 3)
 
 
 def test_a_sensor_check_counts_markers() -> None:

@@ -17,7 +17,7 @@ from touchgoal.control.arms import franka, ur
 from touchgoal.control.arms.streaming import ArmConfig, ArmProcess
 from touchgoal.control.cell.config import CameraName, CellConfig, FingertipsSection
 from touchgoal.control.cell.limits import cell_limits
-from touchgoal.control.cell.twin_client import LockStepClock, ask_twin
+from touchgoal.control.cell.twin_client import LockStepClock, ask_twin, lease_twin, reset_scene
 from touchgoal.control.grippers.franka_hand import FrankaHand, NonBlockingGripper
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell
@@ -131,11 +131,16 @@ class CellConnection:
 def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellConnection:
     """Connect to everything in a cell with a real arm or a twin; commands will come at `hz`.
 
-    A lock-step twin begins the episode of `task.seed`, or goes on with its own if not `new_episode`.
-    UserError names all devices that do not open, after a row for each; the others are released.
+    A twin is taken until the connection closes. It first puts the scene of `task.seed` back, or goes on
+    with its own if not `new_episode`. UserError: another program has the twin; or devices do not open,
+    all of which are named, after a row for each. The others are released.
     """
     robot, rows = cell_limits(cell), list[CheckResult]()
     with ExitStack() as undo:
+        lease = undo.enter_context(lease_twin(cell.task.twin)) if cell.task.twin else None
+        if lease and new_episode:
+            reset_scene(cell.task.twin, cell.task.seed)
+            print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
 
         def opened(name: str, open_device: Callable[[], Any]) -> Any:
             try:
@@ -169,7 +174,7 @@ def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellC
             clock = ArmClock(arm)
         undo.pop_all()
     truth = partial(ask_twin, cell.task.twin, "truth") if cell.task.twin else None
-    return CellConnection(robot, arm, gripper, cameras, load_cell, clock, truth)
+    return CellConnection(robot, arm, gripper, cameras, load_cell, clock, truth, lease)
 
 
 def camera_formats(cell: CellConfig) -> dict[str, tuple[float, int, int]]:
