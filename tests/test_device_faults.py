@@ -5,9 +5,11 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -23,7 +25,8 @@ from fake_cell import (
 )
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell import connection
+from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
 from touchgoal.control.deployment.control_loop import Request
 from touchgoal.control.deployment.hand import HandMonitor
 from touchgoal.control.deployment.preflight import preflight
@@ -133,6 +136,31 @@ def test_whatever_a_device_raises_a_run_ends_in_good_order(
         assert ending.advice and arm.stopped == (where != "arm.stop")
         assert ("emergency stop" in ending.advice) == (where == "arm.stop")
         assert np.isfinite(ending.rest_seconds) == (where != "arm.read")
+
+
+@pytest.mark.parametrize("error", [kind("it broke") for kind in ERRORS], ids=repr)
+def test_what_was_opened_is_closed_if_a_device_does_not_open(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """One line says which; that a device does not close either holds up nothing."""
+    closed: list[str] = []
+
+    def opens(name: str, *_: object) -> Any:
+        close = partial(closed.append, name)
+        return Faulty(
+            SimpleNamespace(close=close), "close", error, lambda: name == "front" and not close()
+        )
+
+    monkeypatch.setattr(connection, "connect_camera", lambda _, key: opens(key.split(".")[-1]))
+    monkeypatch.setattr(connection, "_gripper", partial(opens, "gripper"))
+    monkeypatch.setattr(connection, "connect_arm", MagicMock(side_effect=error))
+    cell = replace(read_cell_file(find_cell_file(Path("fr3_two_minis"))), load_cell=None)
+    with pytest.raises(UserError, match="^arm: .*it broke$"):
+        connection.connect_cell(cell, ft.CONTROL_HZ)
+    tips = ["tactile_right", "tactile_left"]
+    assert closed == ["gripper", *tips, "front"]
+    told = capsys.readouterr()
+    assert "MISSING  arm" in told.out and "did not close: it broke" in told.err
 
 
 class NewImages(FakeCamera):
