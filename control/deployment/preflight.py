@@ -73,7 +73,7 @@ def preflight(
     for key, camera in connection.cameras.items():
         check = partial(_camera, camera, rates[key], nominal[key], tips_seen.get(key, []))
         checks.append((key.removeprefix(ft.IMAGE_PREFIX), check))
-    if tips and tips.sensor_files:
+    if tips:
         checks.append(("fingertips", lambda: _fingertips(connection)))
     if connection.load_cell:
         checks.append(("load cell", lambda: _load_cell(connection)))
@@ -242,18 +242,21 @@ def _fingertip(camera: TactileSensor) -> tuple[Image, Image]:
 
 
 def _fingertips(connection: CellConnection) -> str:
-    """Check that each fingertip looks like its own sensor file."""
+    """Check that each fingertip looks like its own sensor file, where the two files tell them apart."""
     left, right = (
         _fingertip(camera)
         for key in ft.TACTILE
         if isinstance(camera := connection.cameras[key], TactileSensor)
     )
-    if fingertips_exchanged((left[0], right[0]), (left[1], right[1])):
+    frames = left[0], right[0]
+    if fingertips_exchanged(frames, (left[1], right[1])):
         raise UserError(
             "they look exchanged, each like the other's sensor file: exchange fingertips.left and "
             "fingertips.right in the cell file, or the two sensors"
         )
-    return "neither looks like the other's sensor file"
+    if fingertips_exchanged(frames, (right[1], left[1])):  # which holds, the other way round
+        return "each looks like its own sensor file"
+    return "left and right not checked: their sensor files do not tell them apart"
 
 
 def _load_cell(connection: CellConnection) -> str:
