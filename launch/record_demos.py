@@ -53,7 +53,7 @@ class Config:
     hand: TeleoperationConfig = TeleoperationConfig()
     """Response of the hand to the device."""
     yes: bool = False
-    """Do not ask for the typed confirmation (for tests)."""
+    """Do not ask for a touch of each fingertip and the typed confirmation (for tests)."""
     out: Path | None = None
     """Folder of the run; the episodes go to its `episodes/`, after those already there."""
 
@@ -77,14 +77,15 @@ def main(config: Config) -> None:
     if config.device != "scripted" and (sys.stdin is None or not sys.stdin.isatty()):
         raise UserError("nobody is there to lead the arm: run it in a terminal")
     check_client(cell)
-    if not config.yes:
-        confirm(cell)
     out = open_run(config.out, "record-demos", config, adds=True)
-    numbers, ending = [], Ending("begins", done=True)
+    numbers, ending, confirmed = [], Ending("begins", done=True), config.yes
     while len(numbers) < config.episodes:
         print(f"\n{cell.task.name}: {len(numbers) + 1} of {config.episodes}", flush=True)
         with closing(connect(cell)) as connection:
             safety = check_cell(cell, connection, out / "episodes")
+            if not confirmed:
+                confirm(cell, connection)
+                confirmed = True
             if config.device != "scripted":
                 ending = _put_back(config, connection, safety)
                 if not ending.done:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from in_process import run
 from scipy.spatial.transform import Rotation
 
 from touchgoal.control import features as ft
+from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.scripted import PickPlacePoses
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.motion.kinematics import Kinematics
@@ -33,6 +35,7 @@ from touchgoal.control.teleoperation.yielding import YieldingHand
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch import record_demos
 from touchgoal.launch.deploy import NOT_DONE
+from touchgoal.launch.support import confirm
 from touchgoal.runtime.errors import UserError
 
 OBSERVED: dict = {}
@@ -182,9 +185,12 @@ def test_own_demonstrations_train_a_policy_that_deploys(
     """At toy size: nothing is any good, and nothing knows more than the cell's sensors."""
     cell, down = write_cell_file(tmp_path, CELL), [0, 0, -0.5, 0, 0, 0]
     monkeypatch.setattr(record_demos, "_open_device", lambda *_: Pushed(down, ticks=20))
+    monkeypatch.setattr(confirm, "confirm", confirmed := MagicMock())
     for name, seed, episodes in (("train", 0, 2), ("validation", 100_000, 1)):
         run("record-demos", cell, "--device", "scripted", "--episodes", episodes, "--seed", seed,
-            "--yes", "--out", tmp_path / name)  # fmt: skip
+            "--out", tmp_path / name)  # fmt: skip
+    asked = [type(call.args[1]) for call in confirmed.call_args_list]
+    assert asked == [CellConnection] * 2  # once a command, with the fingertips to be touched
     found = EpisodeSet(tmp_path / "train" / "episodes")
     assert len(found) == 2 and not any(key.startswith("truth.") for key in found.features)
     frames, meta = found.read(0).frames, found.meta(0)
