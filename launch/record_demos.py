@@ -6,6 +6,7 @@ arm ends the command; start it again with the same --out to go on. Exit status: 
 """
 
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -60,8 +61,6 @@ class Config:
 
 def main(config: Config) -> None:
     """Record one demonstration after the other; each begins with deploy's checks."""
-    from contextlib import closing
-
     from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
     from touchgoal.control.deployment.control_loop import DISCARDED, STOPPED_BY_OPERATOR, Ending
     from touchgoal.control.deployment.preflight import check_client
@@ -111,8 +110,6 @@ def main(config: Config) -> None:
 
 def _put_back(config: Config, connection: "CellConnection", safety: "ActionFilter") -> "Ending":
     """Let a person lead the arm without a record; the ending is `done` once they are ready."""
-    from contextlib import closing
-
     from touchgoal.control.deployment.control_loop import ControlLoop
     from touchgoal.control.deployment.terminal import Terminal
     from touchgoal.control.run_log import RunLog
@@ -138,8 +135,6 @@ def _record(
     safety: "ActionFilter",
     episodes: Path,
 ) -> "Result":
-    from contextlib import closing
-
     from touchgoal.control.deployment.session import Session
     from touchgoal.control.deployment.terminal import RECORDING_HELP, Terminal
     from touchgoal.control.teleoperation.keyboard_device import HELP

@@ -21,7 +21,7 @@ from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.cell.twin_client import LockStepClock, ask_twin, lease_twin, reset_scene
 from touchgoal.control.grippers.franka_hand import FrankaHand, NonBlockingGripper
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
-from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell
+from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell, TactileSensor
 from touchgoal.control.safety.limits import RobotLimits
 from touchgoal.control.sensors.fingertip_source import fingertip_video
 from touchgoal.control.sensors.load_cell import SerialLoadCell
@@ -117,18 +117,23 @@ class CellConnection:
     truth: Callable[[], dict[str, Any]] | None = None
     lease: socket | None = None  # of the twin; others may use it once this is closed
 
+    @property
+    def fingertips(self) -> dict[str, TactileSensor]:
+        """Those of the cameras that are fingertips."""
+        return {key: c for key, c in self.cameras.items() if isinstance(c, TactileSensor)}
+
     def close(self) -> None:
         """Close the arm first; a device that fails to close is named, and holds up nothing."""
         clock = self.clock if isinstance(self.clock, LockStepClock) else None
         devices = (self.arm, self.gripper, *self.cameras.values(), self.load_cell)
         for device in (clock, *devices, self.lease):
-            if device is not None:
-                _close(device)
+            _close(device)
 
 
 def _close(device: Any) -> None:
     try:
-        device.close()
+        if device is not None:
+            device.close()
     except Exception as error:  # of any driver
         print(f"{type(device).__name__} did not close: {error}", file=sys.stderr)
 
@@ -151,11 +156,11 @@ def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellC
         def opened(name: str, open_device: Callable[[], Any]) -> Any:
             try:
                 device = open_device()
-                undo.callback(_close, device)
-                rows.append(CheckResult(name, True, "opened"))
             except Exception as error:  # of any driver
-                device = None
                 rows.append(CheckResult(name, False, "", error_line(error)))
+                return None
+            rows.append(CheckResult(name, True, "opened"))
+            undo.callback(_close, device)
             return device
 
         cameras: dict[str, Camera] = {

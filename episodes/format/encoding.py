@@ -41,7 +41,7 @@ from touchgoal.runtime.image_file import decode_image
 
 # Reading one window of touch reads a few groups, not the whole episode; the writer holds 35 kB of
 # metadata a group.
-FRAMES_PER_ROW_GROUP, _MAX_ROW_GROUPS = 32, 500
+_ROWS_PER_GROUP, _MAX_ROW_GROUPS = 32, 500
 _FOOTER_KEY, _CHECKSUM_KEY = b"touchgoal", b"touchgoal.crc32"
 # Measured on noisy 320 x 240 touch: 3.6 ms and 90 kB a frame; OpenCV's default filter 8.1 ms and
 # 110 kB, PIL at compress_level 1 11.0 ms and 114 kB.
@@ -67,6 +67,11 @@ class Description:
     stats: dict[str, statistics.Stats]  # key -> statistics, without the index columns
     video_crc32: dict[str, int]  # camera key -> checksum of its MP4 file
 
+    @property
+    def rows_per_group(self) -> int:
+        """Frames in a row group of the data file."""
+        return max(_ROWS_PER_GROUP, -(-self.length // _MAX_ROW_GROUPS))
+
 
 @dataclass(frozen=True, eq=False)
 class EncodedEpisode:
@@ -90,10 +95,9 @@ def encode(episode: Episode, fps: int, folder: Path | None = None) -> EncodedEpi
         values = episode.frames[key]
         if is_camera(key):
             videos[key] = encode_video(values, fps, folder)
-        elif is_image(key):
-            columns[key] = values if folder else [encode_png(image) for image in values]
         else:
-            columns[key] = values
+            encodes = is_image(key) and not folder
+            columns[key] = [encode_png(image) for image in values] if encodes else values
         compute = statistics.image_statistics if is_image(key) else statistics.array_statistics
         stats[key] = compute(values)
     description = Description(
@@ -148,23 +152,17 @@ def write_data_file(
     """Write the Parquet file of an episode's numbers and touch, with its description in the footer."""
 
     def tables() -> Iterator[pa.Table]:
-        size = _frames_per_row_group(encoded.description)
+        size = encoded.description.rows_per_group
         for begin in range(0, encoded.description.length, size):
             rows = slice(begin, begin + size)
             arrays = {
-                key: _png_array(c[rows], begin, path.parent)
-                if is_image(key)
-                else _number_array(key, np.asarray(c[rows]))
+                key: _to_arrow(key, c[rows], begin, path.parent)
                 for key, c in encoded.columns.items()
             }
             yield pa.table(arrays | {key: pa.array(c[rows]) for key, c in indices.items()})
 
     with atomic_write(path) as unfinished:
         write_tables(unfinished, tables(), encoded.description)
-
-
-def _frames_per_row_group(description: Description) -> int:
-    return max(FRAMES_PER_ROW_GROUP, -(-description.length // _MAX_ROW_GROUPS))
 
 
 def write_tables(path: Path, tables: Iterable[pa.Table], description: Description) -> None:
@@ -186,7 +184,7 @@ def write_tables(path: Path, tables: Iterable[pa.Table], description: Descriptio
         write_batch_size=8,  # rows between two looks at the size of a page, which lies in memory
     ) as file:
         for table in chain([first], marked):
-            file.write_table(table, _frames_per_row_group(description))
+            file.write_table(table, description.rows_per_group)
 
 
 def has_description(file: pq.ParquetFile) -> bool:
@@ -216,10 +214,15 @@ def read_description(file: pq.ParquetFile) -> Description:
     return description
 
 
-def _png_array(
-    column: Shaped[np.ndarray, "n h w 3"] | list[bytes], first: int, folder: Path
+def _to_arrow(
+    key: str, column: Shaped[np.ndarray, "n ..."] | list[bytes], first: int, folder: Path
 ) -> pa.Array:
-    """Return a column of images or PNGs, which lie in a nameless file in `folder`, not in memory."""
+    """Return a column; PNGs lie in a nameless file in `folder`, not in memory."""
+    if not is_image(key):
+        values = np.ascontiguousarray(column)
+        flat = pa.array(values.reshape(-1))
+        one = FEATURES[key].shape == (1,)
+        return flat if one else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
     with tempfile.TemporaryFile(dir=folder) as file:
         sizes = [file.write(x if isinstance(x, bytes) else encode_png(x)) for x in column]
         file.flush()
@@ -228,14 +231,6 @@ def _png_array(
     pngs = pa.BinaryArray.from_buffers(pa.binary(), len(sizes), [None, ends, data])
     names = pa.array(f"frame-{first + i:06d}.png" for i in range(len(sizes)))
     return pa.StructArray.from_arrays([pngs, names], names=["bytes", "path"])
-
-
-def _number_array(key: str, column: Shaped[np.ndarray, "n d"]) -> pa.Array:
-    values = np.ascontiguousarray(column)
-    flat = pa.array(values.reshape(-1))
-    if FEATURES[key].shape == (1,):
-        return flat
-    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
 def read_columns(
