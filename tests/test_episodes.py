@@ -47,7 +47,7 @@ def test_a_long_episode_is_written_in_few_groups_and_little_memory(
     episode, usual = make_episode(0, 100), pa.default_memory_pool()
     pool = pa.proxy_memory_pool(usual)
     noise = np.random.default_rng(0).integers(0, 256, (100, 160, 240, 3), np.uint8)
-    episode.frames[ft.TACTILE_LEFT] = noise  # 12 MB as PNG
+    episode.frames[ft.TACTILE_LEFT] = noise  # 12 MB
     pa.set_memory_pool(pool)
     try:
         EpisodeWriter(tmp_path, FPS).append(episode)
