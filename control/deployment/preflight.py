@@ -73,7 +73,7 @@ def preflight(
     for key, camera in connection.cameras.items():
         check = partial(_camera, camera, rates[key], nominal[key], tips_seen.get(key, []))
         checks.append((key.removeprefix(ft.IMAGE_PREFIX), check))
-    if tips and tips.sensor_files:
+    if tips:
         checks.append(("fingertips", lambda: _fingertips(connection)))
     if connection.load_cell:
         checks.append(("load cell", lambda: _load_cell(connection)))
@@ -87,28 +87,21 @@ def preflight(
 
 def watch_cameras(connection: CellConnection) -> tuple[dict[str, float], dict[str, list[Image]]]:
     """Return the rate of each camera (Hz), by the connection's clock, and each fingertip's frames."""
-    clock, begin = connection.clock, connection.clock.now()
-    before = _sequences(connection)
-    found: dict[str, dict[int, Image]] = {}
-    while clock.now() < begin + _WATCH_SECONDS - 1e-9:
-        clock.wait(min(clock.now() + _WATCH_INTERVAL, begin + _WATCH_SECONDS))
+    clock, begin, seconds = connection.clock, connection.clock.now(), 0.0
+    sequences: dict[str, list[int]] = {key: [] for key in connection.cameras}
+    found: dict[str, dict[int, Image]] = {key: {} for key in connection.fingertips}
+    while True:
         for key, camera in connection.cameras.items():
-            if isinstance(camera, TactileSensor):
-                with suppress(Exception):  # of any driver; the camera's own check says so
-                    frame = camera.read()
-                    found.setdefault(key, {})[frame.sequence] = frame.image
-    after, seconds = _sequences(connection), clock.now() - begin
-    rates = {key: (after[key] - before[key]) / seconds for key in after}
+            with suppress(Exception):  # of any driver; the camera's own check says so
+                frame = camera.read()
+                sequences[key].append(frame.sequence)
+                if key in found:
+                    found[key][frame.sequence] = frame.image
+        if (seconds := clock.now() - begin) > _WATCH_SECONDS - 1e-9:
+            break
+        clock.wait(min(clock.now() + _WATCH_INTERVAL, begin + _WATCH_SECONDS))
+    rates = {key: (n[-1] - n[0]) / seconds if n else 0.0 for key, n in sequences.items()}
     return rates, {key: list(frames.values()) for key, frames in found.items()}
-
-
-def _sequences(connection: CellConnection) -> dict[str, int]:
-    """Return the number of images each camera has taken; 0 for a broken one."""
-    counts = dict.fromkeys(connection.cameras, 0)
-    for key, camera in connection.cameras.items():
-        with suppress(Exception):  # of any driver; the camera's own check says so
-            counts[key] = camera.read().sequence
-    return counts
 
 
 def _run_check(what: str, check: Callable[[], str]) -> CheckResult:
@@ -242,18 +235,17 @@ def _fingertip(camera: TactileSensor) -> tuple[Image, Image]:
 
 
 def _fingertips(connection: CellConnection) -> str:
-    """Check that each fingertip looks like its own sensor file."""
-    left, right = (
-        _fingertip(camera)
-        for key in ft.TACTILE
-        if isinstance(camera := connection.cameras[key], TactileSensor)
-    )
-    if fingertips_exchanged((left[0], right[0]), (left[1], right[1])):
+    """Check that each fingertip looks like its own sensor file, where the two files tell them apart."""
+    left, right = (_fingertip(connection.fingertips[key]) for key in ft.TACTILE)
+    frames = left[0], right[0]
+    if fingertips_exchanged(frames, (left[1], right[1])):
         raise UserError(
             "they look exchanged, each like the other's sensor file: exchange fingertips.left and "
             "fingertips.right in the cell file, or the two sensors"
         )
-    return "neither looks like the other's sensor file"
+    if fingertips_exchanged(frames, (right[1], left[1])):  # which holds, the other way round
+        return "each looks like its own sensor file"
+    return "left and right not checked: their sensor files do not tell them apart"
 
 
 def _load_cell(connection: CellConnection) -> str:
