@@ -24,7 +24,7 @@ from touchgoal.control.sensors.exchanged import fingertips_exchanged
 from touchgoal.control.tactile.contact import coarse, contact_strength, threshold_for
 from touchgoal.control.tactile.image_guard import check_untouched
 from touchgoal.control.tactile.indentation import require_readable
-from touchgoal.control.tactile.markers.tracker import find_markers, without_markers
+from touchgoal.control.tactile.markers.tracker import without_dots
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime.errors import CheckResult, UserError
@@ -227,11 +227,8 @@ def _camera(camera: Camera, rate: float, nominal: float, frames: list[Image]) ->
 
 def _fingertip(camera: TactileSensor) -> tuple[Image, Image]:
     """Return a fingertip's image and its sensor file's background, both without dots."""
-    frame, model = camera.read().image, camera.model
-    if model.markers is not None:  # the dots' places differ from unit to unit
-        dots = find_markers(frame, model.markers, model.pixel_pitch)
-        frame = without_markers(frame, dots.positions, dots.largest_radius(model.markers))
-    return frame, load(model.sensor_file).background
+    model = camera.model
+    return without_dots(camera.read().image, model), load(model.sensor_file).background
 
 
 def _fingertips(connection: CellConnection) -> str:
