@@ -2,6 +2,7 @@
 
 import threading
 from contextlib import closing
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from rerun_rows import rerun_rows
 
 from touchgoal.control.calibration.ball import press_surface
+from touchgoal.control.calibration.check_report import figures, lines
 from touchgoal.control.calibration.press_recorder import PressRecorder
 from touchgoal.control.calibration.press_set import read_presses
 from touchgoal.control.calibration.sensor_check import check_sensor
@@ -23,6 +25,7 @@ from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import (
     GELSIGHT_MINI,
     GELSIGHT_MINI_MARKERS,
+    SENSORS,
     find_sensor,
 )
 from touchgoal.episodes.touches import touch_background
@@ -167,6 +170,11 @@ def test_a_sensor_check_reads_noise_ball_and_contact(balls: list[np.ndarray]) ->
     # The noise of one count is a part of the change, and no depth explains it.
     assert max(press.unexplained for press in check.presses) < 0.2
     assert not check.drift.large and not check.drift_from_file.large
+    computed = check_sensor(balls, replace(GELSIGHT_MINI, measured=False), ball_radius=4e-3)
+    assert computed.touching == 3 and not computed.presses and not computed.presses_unexplained
+    printed = "\n".join(lines(computed, figures(computed, 4.0, None)))
+    assert "images only" in printed and "force  " not in printed and "ball  " not in printed
+    assert [name for name in SENSORS if SENSORS[name].images_only] == ["gelsight_wedge"]
 
 
 def test_check_sensor_says_what_is_off(

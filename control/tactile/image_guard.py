@@ -142,7 +142,7 @@ def check_unpressed(image: Image, sensor: SensorModel, name: str) -> None:
     calibration = load(sensor.sensor_file)
     background = calibration.background.astype(np.float32)
     change = local_change(remove_gain(image, background), background)
-    if sensor.markers is not None or float(change.max()) < _PRESSED:
+    if sensor.markers or sensor.images_only or float(change.max()) < _PRESSED:
         return
     read = explain(DepthEstimator(calibration, _CELL), calibration, image, background)
     if read.unexplained <= _PRESS_LEFT:

@@ -37,7 +37,8 @@ class ContactReader:
         self._pitch, self._size = 0.0, untouched.shape[2:0:-1]
         if sensor is not None:
             calibration = load(sensor.sensor_file)
-            self._depth = DepthEstimator(calibration, _CELL)
+            if not sensor.images_only:
+                self._depth = DepthEstimator(calibration, _CELL)
             self._pitch = calibration.pixel_pitch
             self._size = calibration.background.shape[1::-1]
         untouched = np.stack([self._resized(frame) for frame in untouched])
@@ -48,7 +49,7 @@ class ContactReader:
     def read(self, frames: UInt8[np.ndarray, "n h w 3"]) -> dict[str, np.ndarray]:
         """Return by part (`features.embedded`) the readings of the next frames, (n,) or (n, 2).
 
-        Of a sensor without a calibration file, whether it touches alone.
+        Of a sensor without a calibration file, or a computed one, whether it touches alone.
         """
         held, force, centre, slip = [], [], [], []
         for frame in frames:
@@ -58,7 +59,7 @@ class ContactReader:
             centre.append(c)
             slip.append(self._slip.update(touching, c))
         readings = {"held": np.array(held)}
-        if self._sensor is None:
+        if self._depth is None:
             return readings
         numbers = {"force": force, "centre": centre, "slip": slip}
         return readings | {name: np.array(n, np.float32) for name, n in numbers.items()}

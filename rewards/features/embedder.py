@@ -1,6 +1,7 @@
 """Embedding of trajectories and goals with frozen encoders, in one go or piece by piece."""
 
 import hashlib
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
@@ -100,6 +101,8 @@ class EpisodeEmbedder:
                 self._aligned.check_towers(towers)
             encoder.eval()
             hashed, sensor = _weights_hash(encoder), encoder.config.sensor or ""
+            if parts and (model := SENSORS.get(sensor)) and model.images_only:
+                print(model.images_only, file=sys.stderr)
             self.made_with = replace(self._images_with, encoder=hashed, sensor=sensor)
 
     @cached_property
