@@ -31,6 +31,7 @@ from touchgoal.control.tactile.sensor_models import (
 from touchgoal.episodes.touches import touch_background
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.image_file import write_image
 from touchgoal.sim_envs.config import NO_RANDOMIZATION
 from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render_untouched
@@ -142,12 +143,26 @@ def balls() -> list[np.ndarray]:
 
 
 def test_the_start_of_a_clip_is_no_untouched_gel_by_itself(
-    balls: list[np.ndarray], capsys: pytest.CaptureFixture[str]
+    balls: list[np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Dark first frames are named and left out; a clip pressed in all its frames is told as that."""
     for pressed in balls[12:15]:
         with pytest.raises(UserError, match="the recording begins in touch"):
             check_sensor([pressed] * 20, GELSIGHT_MINI)
+    files = [tmp_path / "background.png", tmp_path / "clip" / "0.png", tmp_path / "clip" / "1.png"]
+    for path, frame in zip(files, (balls[0], *balls[12:14]), strict=True):
+        write_image(path, frame)
+    main(
+        [
+            "check-sensor",
+            str(tmp_path / "clip"),
+            "--background",
+            str(files[0]),
+            "--out",
+            str(tmp_path / "out"),
+        ]
+    )
+    assert "3, 2 of them touched" in capsys.readouterr().out
     dark = [(0.5 * frame).astype(np.uint8) for frame in balls[:5]]
     settling = [*dark, *balls]
     check = check_sensor(settling, GELSIGHT_MINI)
