@@ -50,11 +50,7 @@ def main(config: Config) -> None:
     """Read the frames, print what they show, and draw the firmest presses."""
     from touchgoal.control.calibration import check_report
     from touchgoal.control.calibration.sensor_check import check_sensor
-    from touchgoal.control.sensors.fingertip_source import (
-        is_recorded,
-        open_frames,
-        recorded_frames,
-    )
+    from touchgoal.control.sensors import fingertip_source
     from touchgoal.control.tactile.background import SETTLES_WITHIN
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.runtime.image_file import write_image
@@ -65,11 +61,13 @@ def main(config: Config) -> None:
     sensor, seconds = find_sensor(config.sensor), config.seconds
     ball = config.ball_mm and config.ball_mm * 1e-3
     out = open_run(config.out, "check-sensor", config)
-    if not is_recorded(config.source):
+    if not fingertip_source.is_recorded(config.source):
         print(f"leave the gel untouched for a second, then press; {seconds:g} s", flush=True)
-    frames = open_frames(config.source, sensor, config.corners, config.exposure, seconds=seconds)
+    frames = fingertip_source.open_frames(
+        config.source, sensor, config.corners, config.exposure, seconds=seconds
+    )
     if config.background is not None:
-        untouched = recorded_frames(config.background, sensor, config.corners)
+        untouched = fingertip_source.recorded_frames(config.background, sensor, config.corners)
         frames = chain(islice(untouched, SETTLES_WITHIN), frames)
     if config.rerun is None:
         check = check_sensor(frames, sensor, ball)

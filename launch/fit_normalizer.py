@@ -74,10 +74,8 @@ def main(config: Config) -> None:
 
     keys = parse_keys(config.keys)
     with_touch = config.towers is None or config.encoder is not None
-    sources = open_successes(
-        *(config.sources, config.camera, with_touch, config.assume_success, keys),
-        config.background,
-    )
+    named, success = (config.sources, config.camera), config.assume_success
+    sources = open_successes(*named, with_touch, success, keys, config.background)
     inputs = sources[0].inputs
     embedder = Reward(encoder=config.encoder, towers=config.towers).embedder(inputs)
     trajectories = [t for source in sources for t in source.trajectories]

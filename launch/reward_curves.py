@@ -99,10 +99,8 @@ def main(config: Config) -> None:
         device=config.device,
     )
     with_touch = config.towers is None or config.encoder is not None
-    source = open_source(
-        *(config.source, config.camera, config.index, with_touch, config.fps, keys),
-        config.background,
-    )
+    named = config.source, config.camera, config.index
+    source = open_source(*named, with_touch, config.fps, keys, config.background)
     notices = [source.summary] if source.summary else []
     rewards = reward.prepare_source(source)
     specs = [spec for one in rewards.values() for spec in one.goals.values()]

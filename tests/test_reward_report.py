@@ -142,7 +142,7 @@ def test_videos_are_found_by_their_names(tmp_path: Path, monkeypatch: pytest.Mon
     apart = open_source(folder, "front", background=gels[:1]).trajectories[0]
     np.testing.assert_array_equal(apart.untouched[TACTILE_LEFT], touch[:1])
     assert apart.checksum() != source.trajectories[0].checksum()
-    for wrong, says in ((gels[1:], "320 x 120 px"), (gels, "has 1 fingertip videos")):
+    for wrong, says in ((gels[1:], r"\(120, 320\)"), (gels, "its videos")):
         with pytest.raises(UserError, match=says):
             open_source(folder / "a2.mp4", "front", background=wrong)
     line = write_skipped(source.skipped, 5, tmp_path)

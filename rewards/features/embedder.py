@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from itertools import chain
-from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -125,7 +124,7 @@ class EpisodeEmbedder:
         chunks: Iterable[Episode],
         fps: float,
         source: str,
-        untouched: Mapping[str, Images] = MappingProxyType({}),
+        untouched: Mapping[str, Images] | None = None,
     ) -> EmbeddedEpisode:
         """Embed consecutive chunks of one episode, as `embed_episode` embeds it in one go.
 
@@ -140,8 +139,9 @@ class EpisodeEmbedder:
                 f"{source} starts in contact, so its fingertips have no background; record it "
                 f"with {START_FRAMES} frames before the first touch"
             )
-        stream = self.stream({**first.frames, **untouched}, fps, source)
-        search, pieces = ContactSearch(untouched), []
+        apart = untouched or {}
+        stream = self.stream({**first.frames, **apart}, fps, source)
+        search, pieces = ContactSearch(apart), []
         for chunk in chain([first], following):
             search.update(chunk)
             pieces.append(stream.embed(chunk.frames))

@@ -214,18 +214,11 @@ def _backgrounds(
     name: str, clips: Mapping[str, Clip], given: Sequence[Images]
 ) -> dict[str, Images]:
     """Return the untouched frames given for each fingertip; UserError if they do not fit its video."""
-    sides = [key for key in TACTILE if key in clips]
-    if given and len(given) != len(sides):
-        raise UserError(
-            f"{name} has {len(sides)} fingertip videos: give --background as many files"
-        )
-    for side, frames in zip(sides, given, strict=False):
-        if frames.shape[1:3] != clips[side].shape:
-            wrong = " x ".join(map(str, frames.shape[2:0:-1]))
-            raise UserError(
-                f"--background is {wrong} px, {clips[side].path} is not: give it as the video shows it"
-            )
-    return dict(zip(sides, given, strict=False))
+    sides = [key for key in TACTILE if key in clips] if given else []
+    sizes = [clips[side].shape for side in sides]
+    if (there := [frames.shape[1:3] for frames in given]) != sizes:
+        raise UserError(f"{name}: --background has rows and columns {there}, its videos {sizes}")
+    return dict(zip(sides, given, strict=True))
 
 
 def _read_labels(folder: Path) -> dict[str, dict[str, MetaValue]]:
