@@ -40,6 +40,7 @@ from touchgoal.rewards.sources import trajectory
 from touchgoal.rewards.sources.episode_trajectories import default_goals
 from touchgoal.rewards.sources.open_source import open_source
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.image_file import write_image
 
 EPISODE = recorded()
 REWARD = Reward("last", towers=PaintTowers())
@@ -134,6 +135,16 @@ def test_videos_are_found_by_their_names(tmp_path: Path, monkeypatch: pytest.Mon
     assert set(chunk.frames) == {FRONT, TACTILE_LEFT} and chunk.frames[FRONT].shape == front.shape
     one = open_source(folder / "a2.mp4", "wrist").inputs
     assert (one.camera, one.sides) == (WRIST, (TACTILE_LEFT,))
+    gels = [
+        write_image(tmp_path / f"{n}.png", touch[0, :n]) or tmp_path / f"{n}.png"
+        for n in (240, 120)
+    ]
+    apart = open_source(folder, "front", background=gels[:1]).trajectories[0]
+    np.testing.assert_array_equal(apart.untouched[TACTILE_LEFT], touch[:1])
+    assert apart.checksum() != source.trajectories[0].checksum()
+    for wrong, says in ((gels[1:], r"\(120, 320\)"), (gels, "its videos")):
+        with pytest.raises(UserError, match=says):
+            open_source(folder / "a2.mp4", "front", background=wrong)
     line = write_skipped(source.skipped, 5, tmp_path)
     assert line.startswith("2 of 5 skipped") and "c," in (tmp_path / "skipped.csv").read_text()
 

@@ -57,7 +57,7 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
         _light("drift", check.drift, "lock the exposure, and let the sensor warm up"),
         _light("sensor file", check.drift_from_file, "calibrate this sensor"),
     ]
-    if check.unlike_file > _UNLIKE:
+    if check.unlike_file > _UNLIKE and not check.images_only:
         printed.append(
             "             the untouched gel differs from the sensor file's by "
             f"{check.unlike_file:.1f} counts in one spot: depths and forces are nominal until this "
@@ -67,6 +67,8 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
     if check.markers is not None:
         shift = f"moved by up to {check.largest_shift_px:.1f} px"
         printed.append(f"markers      {100 * check.markers:.0f} % found, {shift}")
+    if check.images_only:
+        printed.append(f"images only  {check.images_only}")
     if refused := check.presses_unexplained:
         printed.append(
             f"refused      {refused} of {refused + len(check.presses)} presses: the sensor file "
