@@ -9,7 +9,7 @@ CODE := runtime control sim_envs episodes encoders rewards policies benchmarks l
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test interop interop-lerobot lint check format build docs typings weights weights-markers maze-policy maze-wrench-policy pick-place-policy pose-estimator fragile-carry clean
+.PHONY: setup demo test interop interop-lerobot lint check format build docs images typings weights weights-markers maze-policy maze-wrench-policy pick-place-policy pose-estimator fragile-carry clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -76,6 +76,17 @@ build: $(READY)
 docs: $(READY)
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	$(BIN)/sphinx-build -W --keep-going -q docs runs/site
+
+# The images of README and docs/rewards.md, by the commands that these pages print; a browser from PyPI shows the page.
+images: $(READY)
+	rm -rf runs/images
+	$(BIN)/pip install -q --disable-pip-version-check --target runs/images/browser PyQt6-WebEngine==6.11.0
+	$(BIN)/touchgoal demo --out runs/images/demo
+	$(BIN)/touchgoal collect-demos --episodes 4 --env.objects glass_ball --out runs/images/data
+	$(BIN)/touchgoal reward-curves runs/images/data/episodes --goal last --goal "text:a hard smooth round object" \
+		--out runs/images/curves
+	QT_QPA_PLATFORM=offscreen QTWEBENGINE_DISABLE_SANDBOX=1 PYTHONPATH=runs/images/browser \
+		$(BIN)/python docs/images.py runs/images
 
 # How the shipped touch encoder was made: about 45 minutes on 2 cores. Words come from the wand's objects and
 # from those of pick-and-place; the normalizer and the value of rewards from successes with ten of them.

@@ -175,7 +175,7 @@ def materials(metrics: Metrics) -> str:
 def faults(metrics: Metrics) -> str:
     """Faults that lose no episode, and the longest time to rest."""
     rows = metrics["rows"]
-    rest = [row["rest"] for row in rows if row["rest"] == row["rest"]]  # NaN: nothing to stop
+    rest = [row["rest"] for row in rows if row["rest"] is not None]  # None: nothing to stop
     whole = sum(row["episodes_whole"] for row in rows)
     return f"{whole} of {len(rows)} keep all episodes; at rest within {max(rest):.2f} s"
 

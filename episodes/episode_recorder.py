@@ -63,7 +63,7 @@ class EpisodeRecorder:
                 if not self._failure:
                     self._write_tick(tick)
             except Exception as error:
-                self._failure = str(error)
+                self._failure = f"{self._root.parent}: {error}"
 
     def _write_tick(self, tick: dict[str, np.ndarray]) -> None:
         folder = self._root.parent

@@ -1,8 +1,7 @@
 """Films of simulated episodes: images, a curve beside them, a caption below."""
 
 import io
-from collections.abc import Iterable, Mapping
-from itertools import cycle
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -18,18 +17,7 @@ from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
 from touchgoal.sim_envs.scene.filming import TICKS_PER_IMAGE
 
-BLACK = "#000000"
-COLORS = ("#0072B2", "#D55E00", "#CC79A7", BLACK, "#009E73", "#56B4E9", "#E69F00", "#7A5C2E")
-"""Okabe and Ito, "Color universal design" (2008), distinct for colour-blind readers, and a brown."""
-_OWN = {
-    "image": 0,
-    "tactile": 1,
-    "text": 2,
-    "words": 2,
-    "fused": 3,
-    "image+tactile": 4,
-    "image+text": 5,
-}
+_BLUE = "#0072B2"
 _DPI = 100
 _PANEL = 320  # px, width of the curves
 _CAPTION = 24  # px, height of the caption
@@ -42,33 +30,29 @@ def write_film(
     control_hz: int,
     curves: Mapping[str, Float[np.ndarray, " ticks"]] | None = None,
     label: str = "",
+    colors: Mapping[str, str] | None = None,
 ) -> None:
     """Write an MP4 that plays in real time: images, curves up to now, object, outcome, seed, time.
 
     Args:
         images: of `record_with_film`, one every `TICKS_PER_IMAGE` ticks.
         control_hz: ticks per second.
-        curves: values at each tick, which may end before the episode; default: the simulator's
-            progress.
+        curves: values at each tick, which may end before the episode: so does the film; default: the
+            simulator's progress.
         label: axis label of the curves.
+        colors: of the curves, by their names; default: blue.
     """
     if curves is None:
         curves, label = {"progress": episode.frames[TRUTH_PROGRESS][:, 0]}, "progress"
-    end = (len(episode) - 1) / control_hz
-    panel, box = _draw_panel(images.shape[1], curves, control_hz, end, label)
+    ticks = max(map(len, curves.values())) - 1
+    panel, box = _draw_panel(images.shape[1], curves, control_hz, label, colors or {})
     frames = []
-    for k, image in enumerate(images):
+    for k, image in enumerate(images[: ticks // TICKS_PER_IMAGE + 1]):
         t = k * TICKS_PER_IMAGE / control_hz
-        beside = np.hstack([image, _up_to(panel, box, t / end)])
+        beside = np.hstack([image, _up_to(panel, box, k * TICKS_PER_IMAGE / ticks)])
         caption = _caption(beside.shape[1], caption_of(episode), f"{t:.1f} s")
         frames.append(np.vstack([beside, caption]))
     write_video(path, np.stack(frames), control_hz / TICKS_PER_IMAGE)
-
-
-def curve_colors(names: Iterable[str]) -> dict[str, str]:
-    """Return each curve's colour, in films, plots and pages; a plain distance has one of its own."""
-    cycled = cycle(k for k, color in enumerate(COLORS) if color != BLACK)
-    return {name: COLORS[_OWN[name] if name in _OWN else next(cycled)] for name in names}
 
 
 def caption_of(episode: Episode) -> str:
@@ -80,21 +64,20 @@ def caption_of(episode: Episode) -> str:
 
 
 def _draw_panel(
-    height: int, curves: Mapping[str, np.ndarray], control_hz: int, end: float, label: str
+    height: int, curves: Mapping[str, np.ndarray], hz: int, label: str, colors: Mapping[str, str]
 ) -> tuple[np.ndarray, BboxBase]:
-    """Return an image of all curves up to `end` (s), and the box of its axes (px)."""
+    """Return an image of all curves, and the box of its axes (px)."""
     figure = Figure(figsize=(_PANEL / _DPI, height / _DPI), dpi=_DPI)
     axes = figure.add_axes((0.16, 0.17, 0.8, 0.66))
-    colors = curve_colors(curves)
     for name, values in curves.items():
-        time = np.arange(len(values)) / control_hz
-        axes.plot(time, values, color=colors[name], label=name, lw=1.5)
-    axes.set_xlim(0, end)
+        time = np.arange(len(values)) / hz
+        axes.plot(time, values, color=colors.get(name, _BLUE), label=name, lw=1.5)
+    axes.margins(x=0)
     axes.set_xlabel("time (s)", fontsize=7, labelpad=1)
     axes.set_ylabel(label, fontsize=7, labelpad=2)
     axes.tick_params(labelsize=7)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="upper center", ncols=3, fontsize=7, frameon=False, handlelength=1.2)
+    figure.legend(loc="upper center", ncols=4, fontsize=7, frameon=False, handlelength=1.2)
     png = io.BytesIO()
     FigureCanvasAgg(figure).print_png(png)
     return np.asarray(Image.open(png).convert("RGB")), axes.get_window_extent()

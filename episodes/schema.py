@@ -1,7 +1,6 @@
 """An episode: synchronised frames, a task in words, and facts about the whole."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -83,13 +82,6 @@ class Episode:
                 )
         for key, value in self.meta.items():
             _check_meta(key, value)
-
-
-def joined(chunks: Iterable[Episode]) -> Episode:
-    """Return consecutive pieces of one episode as one."""
-    pieces = list(chunks)
-    frames = {key: np.concatenate([p.frames[key] for p in pieces]) for key in pieces[0].frames}
-    return Episode(frames, pieces[0].task, pieces[0].meta)
 
 
 def _check_key(features: dict[str, Feature], key: str, values: np.ndarray) -> None:

@@ -16,7 +16,7 @@ from touchgoal.control.tactile.background import (
     untouched_frames,
 )
 from touchgoal.control.tactile.contact import ContactDetector, coarse, threshold_for
-from touchgoal.control.tactile.image_guard import check_untouched
+from touchgoal.control.tactile.image_guard import check_unpressed, check_untouched
 from touchgoal.control.tactile.sensor_models import SENSORS, SensorModel
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
@@ -177,12 +177,13 @@ def _exchanged(frames: tuple[Image, Image], first: tuple[Image, Image]) -> bool:
 
 
 def check_touch(frames: UInt8[np.ndarray, "n h w 3"], sensor: SensorModel, name: str) -> None:
-    """Refuse a fingertip whose first 5 frames contradict its sensor file, or are too compressed.
+    """Refuse a fingertip whose first 5 frames contradict its sensor file, are pressed, or too compressed.
 
-    `name` is for the UserError; see `image_guard.check_untouched` and `contact.coarse`.
+    `name` is for the UserError; see `image_guard` and `contact.coarse`.
     """
     background = touch_background(frames)
     check_untouched(background, sensor, name)
+    check_unpressed(background, sensor, name)
     if wrong := coarse(threshold_for(untouched_frames(frames), background)):
         raise UserError(f"{name}: {wrong}")
 
@@ -195,21 +196,25 @@ def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, 
     return np.median(untouched_frames(frames), axis=0).astype(np.uint8)
 
 
+def contact_detector(frames: UInt8[np.ndarray, "n h w 3"]) -> ContactDetector:
+    """Return a detector of contact, whose background and threshold the first frames give."""
+    untouched, background = untouched_frames(frames), touch_background(frames)
+    return ContactDetector(Background(background[None]), threshold_for(untouched, background))
+
+
 class ContactStream:
     """Contact of one fingertip over consecutive pieces of a recording.
 
-    The first piece begins with 5 frames without contact.
+    The first piece begins with 5 frames without contact, unless `untouched` ones are given.
     """
 
-    def __init__(self) -> None:
-        self._detector: ContactDetector | None = None
+    def __init__(self, untouched: UInt8[np.ndarray, "n h w 3"] | None = None) -> None:
+        self._detector = None if untouched is None else contact_detector(untouched)
 
     def update(self, frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, " t"]:
         """Return whether each of the next frames is in contact."""
         if self._detector is None:
-            untouched, background = untouched_frames(frames), touch_background(frames)
-            threshold = threshold_for(untouched, background)
-            self._detector = ContactDetector(Background(background[None]), threshold)
+            self._detector = contact_detector(frames)
         return np.array([self._detector.update(frame) for frame in frames], bool)
 
 

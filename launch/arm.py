@@ -6,6 +6,7 @@ not read, so gels are not watched. Exit status: 0 done, 1 nothing moved, 4 the a
 """
 
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -54,8 +55,6 @@ def main(config: Config) -> None:
 
 
 def _recover(cell: "CellConfig") -> None:
-    from contextlib import closing
-
     from touchgoal.control import features as ft
     from touchgoal.control.cell.connection import connect_arm
 
@@ -66,8 +65,6 @@ def _recover(cell: "CellConfig") -> None:
 
 
 def _move(move: str, cell: "CellConfig") -> None:
-    from contextlib import closing
-
     import numpy as np
 
     from touchgoal.control.deployment.control_loop import PLAN_ENDED

@@ -5,7 +5,10 @@ table, for the front camera fix it to the hand, flat. Take 15 views and more: ch
 20 degrees and more about two axes. The pose goes into the cell file, for the simulated arm (`--sim`).
 """
 
+import json
 import sys
+from contextlib import closing
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -65,9 +68,6 @@ def main(config: Config) -> None:
 
 
 def _calibrate(config: Config, path: Path, board: "Board") -> None:
-    from contextlib import closing
-    from dataclasses import replace
-
     from touchgoal.control.cell.cell_file import read_cell_file
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.control.hand_eye.record import calibrate_camera
@@ -139,8 +139,6 @@ def _moved(poses: Path, cell: "CellConfig", connection: "CellConnection") -> "It
 
 
 def _read_poses(path: Path, n_joints: int) -> list[Any]:
-    import json
-
     import numpy as np
 
     try:
@@ -162,8 +160,6 @@ def _save_views(views: "list[View]", out: Path) -> None:
 
 
 def _report(result: "HandEye", config: Config, cell_file: Path, out: Path, rows: int) -> None:
-    from dataclasses import asdict
-
     import numpy as np
 
     from touchgoal.control.cell.camera_pose import camera_lines, write_camera

@@ -6,7 +6,7 @@ images. Leave the gel untouched for the first second, then press any object, pre
 """
 
 from collections.abc import Callable
-from itertools import count
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,6 +29,8 @@ class Config:
     corners: Corners | None = None
     """Corners of the gel in the camera's image, x and y in px: top left, top right, bottom left, bottom
     right; for a camera that sees its gel at an angle (gelsight_wedge)."""
+    background: Path | None = None
+    """Clip (or image) of the sensor untouched, for frames that do not begin so. Default: the first."""
     ball_mm: Positive | None = None
     """Radius of the pressed ball, mm, to compare with the radius that the depth shows."""
     weight_g: Positive | None = None
@@ -48,7 +50,8 @@ def main(config: Config) -> None:
     """Read the frames, print what they show, and draw the firmest presses."""
     from touchgoal.control.calibration import check_report
     from touchgoal.control.calibration.sensor_check import check_sensor
-    from touchgoal.control.sensors.fingertip_source import is_recorded, open_frames
+    from touchgoal.control.sensors import fingertip_source
+    from touchgoal.control.tactile.background import SETTLES_WITHIN
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.runtime.image_file import write_image
     from touchgoal.runtime.json_file import write_json
@@ -58,9 +61,14 @@ def main(config: Config) -> None:
     sensor, seconds = find_sensor(config.sensor), config.seconds
     ball = config.ball_mm and config.ball_mm * 1e-3
     out = open_run(config.out, "check-sensor", config)
-    if not is_recorded(config.source):
+    if not fingertip_source.is_recorded(config.source):
         print(f"leave the gel untouched for a second, then press; {seconds:g} s", flush=True)
-    frames = open_frames(config.source, sensor, config.corners, config.exposure, seconds=seconds)
+    frames = fingertip_source.open_frames(
+        config.source, sensor, config.corners, config.exposure, seconds=seconds
+    )
+    if config.background is not None:
+        untouched = fingertip_source.recorded_frames(config.background, sensor, config.corners)
+        frames = chain(islice(untouched, SETTLES_WITHIN), frames)
     if config.rerun is None:
         check = check_sensor(frames, sensor, ball)
     else:

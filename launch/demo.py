@@ -1,7 +1,7 @@
 """The MMWand paper's robot experiment in simulation, on the shipped weights.
 
-A Franka FR3 with a GelSight Mini on each finger picks an object up, places it and lets it go. Until it
-lets go, the distance to the goal is drawn: in the camera image, in touch, in both, and to a sentence.
+A Franka FR3 with a GelSight Mini on each finger picks an object up and places it. Until it lets go, the
+distance to the goal is drawn: in the camera's image, in touch, to a sentence, and of all parts fused.
 """
 
 from dataclasses import replace
@@ -13,6 +13,8 @@ from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import FIXED, Seed, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig
+
+FILMED = ("fused", "front", "object", "words")  # of the curves that the plot shows
 
 if TYPE_CHECKING:
     from touchgoal.episodes.schema import Episode
@@ -42,8 +44,8 @@ def main(config: Config) -> None:
     from touchgoal.episodes.film import write_film
     from touchgoal.episodes.recording import EpisodeSpec, record_with_film
     from touchgoal.episodes.store import EpisodeWriter
-    from touchgoal.rewards.curves import FUSED
     from touchgoal.rewards.goals import Inputs
+    from touchgoal.rewards.report.plot import curve_colors
     from touchgoal.rewards.report.report import write_report
     from touchgoal.rewards.report.tables import metrics_table
     from touchgoal.rewards.reward import Reward
@@ -66,12 +68,13 @@ def main(config: Config) -> None:
     EpisodeWriter(out / "episodes", hz).append(held)
     curves = reward.curves(reward.embedder.embed_episode(held, hz, str(held.meta["object"])))
     write_report(curves, out, "curves", reward.provenance())
-    shown = {FUSED: curves.parts[FUSED], **curves.plain}
-    write_film(out / "episode.mp4", images, episode, hz, shown, "distance to goal")
+    shown = {name: curves.costs[name] for name in FILMED}
+    film = out / "episode.mp4"
+    write_film(film, images, episode, hz, shown, "distance to goal", curve_colors(FILMED))
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
     write_json(out / "metrics.json", {k: m.as_dict() for k, m in curves.metrics().items()})
     print(metrics_table([curves]))
-    print(f"film: {out / 'episode.mp4'}\ncurves: {out / 'curves.png'}\n\n{what_next(out)}")
+    print(f"film: {film}\ncurves: {out / 'curves.png'}\n\n{what_next(out)}")
 
 
 def until_release(episode: "Episode") -> "Episode":

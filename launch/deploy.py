@@ -8,6 +8,7 @@ stopped, by a fault or the operator.
 """
 
 import sys
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -184,8 +185,6 @@ def _deploy(
 
 def _shown_in(stream: "BackgroundStream", dt: float) -> "Callable[[TickStatus], None]":
     """Return what logs a tick of `dt` (s), its command as an episode's action."""
-    from itertools import count
-
     import numpy as np
 
     from touchgoal.control import features as ft

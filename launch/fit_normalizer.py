@@ -36,6 +36,9 @@ class Config:
     keys: Annotated[tuple[str, ...], RARE] = ()
     """Keys of a LeRobot set whose features have other names: STORED=KEY, such as
     observation.images.top=observation.images.front."""
+    background: tuple[Path, ...] = ()
+    """Clip (or image, which shows no noise) of each fingertip untouched, left before right, for videos
+    that do not begin so. Default: their first frames."""
     encoder: str | None = None
     """Touch encoder: a name (touchgoal list encoders), a folder, or a published Sparsh one. Default:
     the one that ships for the episodes' sensor. Sentences need one that is aligned with texts."""
@@ -71,7 +74,8 @@ def main(config: Config) -> None:
 
     keys = parse_keys(config.keys)
     with_touch = config.towers is None or config.encoder is not None
-    sources = open_successes(config.sources, config.camera, with_touch, config.assume_success, keys)
+    named, success = (config.sources, config.camera), config.assume_success
+    sources = open_successes(*named, with_touch, success, keys, config.background)
     inputs = sources[0].inputs
     embedder = Reward(encoder=config.encoder, towers=config.towers).embedder(inputs)
     trajectories = [t for source in sources for t in source.trajectories]

@@ -6,6 +6,7 @@ arm ends the command; start it again with the same --out to go on. Exit status: 
 """
 
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -53,15 +54,13 @@ class Config:
     hand: TeleoperationConfig = TeleoperationConfig()
     """Response of the hand to the device."""
     yes: bool = False
-    """Do not ask for the typed confirmation (for tests)."""
+    """Do not ask for a touch of each fingertip and the typed confirmation (for tests)."""
     out: Path | None = None
     """Folder of the run; the episodes go to its `episodes/`, after those already there."""
 
 
 def main(config: Config) -> None:
     """Record one demonstration after the other; each begins with deploy's checks."""
-    from contextlib import closing
-
     from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
     from touchgoal.control.deployment.control_loop import DISCARDED, STOPPED_BY_OPERATOR, Ending
     from touchgoal.control.deployment.preflight import check_client
@@ -77,14 +76,15 @@ def main(config: Config) -> None:
     if config.device != "scripted" and (sys.stdin is None or not sys.stdin.isatty()):
         raise UserError("nobody is there to lead the arm: run it in a terminal")
     check_client(cell)
-    if not config.yes:
-        confirm(cell)
     out = open_run(config.out, "record-demos", config, adds=True)
-    numbers, ending = [], Ending("begins", done=True)
+    numbers, ending, confirmed = [], Ending("begins", done=True), config.yes
     while len(numbers) < config.episodes:
         print(f"\n{cell.task.name}: {len(numbers) + 1} of {config.episodes}", flush=True)
         with closing(connect(cell)) as connection:
             safety = check_cell(cell, connection, out / "episodes")
+            if not confirmed:
+                confirm(cell, connection)
+                confirmed = True
             if config.device != "scripted":
                 ending = _put_back(config, connection, safety)
                 if not ending.done:
@@ -110,8 +110,6 @@ def main(config: Config) -> None:
 
 def _put_back(config: Config, connection: "CellConnection", safety: "ActionFilter") -> "Ending":
     """Let a person lead the arm without a record; the ending is `done` once they are ready."""
-    from contextlib import closing
-
     from touchgoal.control.deployment.control_loop import ControlLoop
     from touchgoal.control.deployment.terminal import Terminal
     from touchgoal.control.run_log import RunLog
@@ -137,8 +135,6 @@ def _record(
     safety: "ActionFilter",
     episodes: Path,
 ) -> "Result":
-    from contextlib import closing
-
     from touchgoal.control.deployment.session import Session
     from touchgoal.control.deployment.terminal import RECORDING_HELP, Terminal
     from touchgoal.control.teleoperation.keyboard_device import HELP

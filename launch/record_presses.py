@@ -5,6 +5,7 @@ or a folder of images. Leave the gel untouched for a second. Then press the ball
 image shows, hold still until the press is recorded, and lift. Ctrl-C ends and keeps the presses.
 """
 
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -47,8 +48,6 @@ class Config:
 
 def main(config: Config) -> None:
     """Record until the map is full, the recording ends or Ctrl-C; then fit."""
-    from contextlib import closing, nullcontext
-
     from touchgoal.control.calibration.press_recorder import PressRecorder, record_presses
     from touchgoal.control.calibration.press_set import MINIMUM, write_presses
     from touchgoal.control.sensors.fingertip_source import is_recorded, open_frames

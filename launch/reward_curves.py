@@ -38,6 +38,9 @@ class Config:
     observation.images.top=observation.images.front."""
     fps: Positive | None = None
     """Frames per second of folders of images. Default: 20."""
+    background: tuple[Path, ...] = ()
+    """Clip (or image, which shows no noise) of each fingertip untouched, left before right, for videos
+    that do not begin so. Default: their first frames."""
     encoder: str | None = None
     """Touch encoder: a name (touchgoal list encoders), a folder, or a published Sparsh one. Default:
     the one that ships for the episodes' sensor. Sentences need one that is aligned with texts."""
@@ -96,7 +99,8 @@ def main(config: Config) -> None:
         device=config.device,
     )
     with_touch = config.towers is None or config.encoder is not None
-    source = open_source(config.source, config.camera, config.index, with_touch, config.fps, keys)
+    named = config.source, config.camera, config.index
+    source = open_source(*named, with_touch, config.fps, keys, config.background)
     notices = [source.summary] if source.summary else []
     rewards = reward.prepare_source(source)
     specs = [spec for one in rewards.values() for spec in one.goals.values()]

@@ -65,7 +65,7 @@ def main(config: Config) -> None:
     if config.task not in get_args(SimulatedTask):
         return
     cell = "sim" if config.task == "pick-place" else "sim_maze"
-    if changed := _changed_options(config):
+    if changed := _changed_options(config.env, ENVS[config.task]):
         print(
             f"next, serve this task: touchgoal twin --task {config.task} {changed} --out runs/twin"
         )
@@ -77,10 +77,14 @@ def main(config: Config) -> None:
     print(f"{when}, by the control loop that also drives a real arm: {command}")
 
 
-def _changed_options(config: Config) -> str:
-    """Return the options of the task that differ from its own, as typed; nested ones stay away."""
+def _changed_options(given: object, default: object, above: str = "") -> str:
+    """Return the options that differ from the default ones, as typed."""
     from touchgoal.policies.by_name import typed_option
 
-    given, default = vars(config.env), vars(ENVS[config.task])
-    changed = {name: value for name, value in given.items() if value != default[name]}
-    return " ".join(typed_option(*one) for one in changed.items() if not is_dataclass(one[1]))
+    return " ".join(
+        _changed_options(value, usual, f"{above}{name}.")
+        if is_dataclass(value)
+        else typed_option(above + name, value)
+        for (name, value), usual in zip(vars(given).items(), vars(default).values(), strict=True)
+        if value != usual
+    )

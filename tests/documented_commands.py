@@ -36,10 +36,9 @@ TOY = {
     "train-encoder words": "--surfaces 4 --heads.epochs 1 --encoder gelsight_mini",
     "train-encoder surfaces": "--surfaces 16 --presses-per-surface 2",
     "train-policy": "--head tiny --train.epochs 1 --trials 0 --workers 1",
-    "record-demos": "--episodes 1 --yes --hand.speed 0.25 --hand.turn-speed 1.5",
+    "record-demos": "--episodes 1 --hand.speed 0.25 --hand.turn-speed 1.5",
     "fit-normalizer": "--no-value",  # test_commands.py fits one
     "twin": "--port 0 --lock-step",
-    "deploy": "--yes",
 }
 # What is not run here, and where it is, or why not.
 NOT_RUN = {

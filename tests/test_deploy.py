@@ -14,6 +14,7 @@ from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import blocked_packages
 import numpy as np
@@ -293,9 +294,7 @@ def test_nobody_confirms_what_moves_nothing_real(monkeypatch: pytest.MonkeyPatch
 def test_every_device_that_does_not_open_is_a_row(
     capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_arm(*_: object) -> None:
-        raise DriverError("no controller answers")
-
+    no_arm = MagicMock(side_effect=DriverError("no controller answers"))
     monkeypatch.setattr("touchgoal.control.cell.connection.connect_arm", no_arm)
     real = read_cell_file(find_cell_file(Path("fr3_two_minis")))
     gone = replace(real, address="127.9.9.9", load_cell=None)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -23,7 +24,8 @@ from fake_cell import (
 )
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell import connection
+from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
 from touchgoal.control.deployment.control_loop import Request
 from touchgoal.control.deployment.hand import HandMonitor
 from touchgoal.control.deployment.preflight import preflight
@@ -133,6 +135,25 @@ def test_whatever_a_device_raises_a_run_ends_in_good_order(
         assert ending.advice and arm.stopped == (where != "arm.stop")
         assert ("emergency stop" in ending.advice) == (where == "arm.stop")
         assert np.isfinite(ending.rest_seconds) == (where != "arm.read")
+
+
+@pytest.mark.parametrize("kind", ERRORS)
+def test_what_was_opened_is_closed_if_a_device_does_not_open(
+    kind: type[Exception], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    closed: list[str] = []
+
+    def opens(name: str) -> Any:  # the front camera does not close
+        return SimpleNamespace(close=lambda: closed.append(name) or 1 / (name != "front"))
+
+    monkeypatch.setattr(connection, "connect_camera", lambda _, key: opens(key.split(".")[-1]))
+    monkeypatch.setattr(connection, "_gripper", lambda _: opens("gripper"))
+    monkeypatch.setattr(connection, "connect_arm", MagicMock(side_effect=kind("it broke")))
+    cell = replace(read_cell_file(find_cell_file(Path("fr3_two_minis"))), load_cell=None)
+    with pytest.raises(UserError, match="^arm: .*it broke$"):
+        connection.connect_cell(cell, ft.CONTROL_HZ)
+    assert closed == ["gripper", "tactile_right", "tactile_left", "front"]
+    assert "did not close: division by zero" in capsys.readouterr().err
 
 
 class NewImages(FakeCamera):

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ from documented_commands import (
     recipes,
     snippets,
 )
+from PIL import Image
 from test_own_object import write_box
 
 from touchgoal.control.cell.cell_file import read_cell_file
@@ -33,7 +35,10 @@ from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.control.tactile import sensor_models
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.launch.demo import FILMED
 from touchgoal.launch.deploy import NOT_DONE
+from touchgoal.rewards.distance.parts import FUSED, SMALLEST_UNIT, VALUE, WORDS
+from touchgoal.rewards.report.plot import CURVES
 from touchgoal.runtime.parallel.worker_pool import one_core_workers
 
 Shell = Callable[[list[str]], int]
@@ -61,7 +66,7 @@ def test_command_is_understood(command: Command, capsys: pytest.CaptureFixture, 
 
 
 POLICIES = "maze-policy maze-wrench-policy pick-place-policy fragile-carry".split()
-TARGETS = ["demo", "weights", "weights-markers", *POLICIES]
+TARGETS = ["demo", "images", "weights", "weights-markers", *POLICIES]
 
 
 @pytest.mark.parametrize("target", TARGETS)
@@ -69,6 +74,16 @@ def test_recipes_of_the_makefile_are_understood(target: str, here: Path) -> None
     assert recipes(target)
     for words in recipes(target):
         read_options(words)
+
+
+@pytest.mark.parametrize(
+    ("name", "curves"),
+    [("demo", {*FILMED}), ("reward_page", {*SMALLEST_UNIT, VALUE, WORDS, FUSED})],
+)
+def test_images_show_the_curves_of_today(name: str, curves: set[str]) -> None:
+    """By their names and colours; else: make images."""
+    with Image.open(ROOT / "docs" / f"{name}.png") as image:
+        assert json.loads(image.info["curves"]) == {curve: CURVES[curve] for curve in curves}
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +141,7 @@ def test_deploying_without_a_twin_runs(desk: Path, shell: Shell) -> None:
     for command in DEPLOYING:
         words = command.small
         if command.words[0] == "launch/deploy.sh":
-            program = [str(ROOT / command.words[0]), *words, "--yes"]
+            program = [str(ROOT / command.words[0]), *words]
             with _cut(desk / words[0]) if "--execute" not in words else nullcontext():
                 path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
                 done = subprocess.run(program, env={**os.environ, "PATH": path})
@@ -205,10 +220,18 @@ def test_snippets_run(
             c for c in TYPED if c.line.startswith("touchgoal collect-demos --episodes 4")
         )
         assert exit_status(recording.small) == 0
+    made: dict[str, Any] = {}
     for i, code in enumerate(snippets(page)):
         program = desk / f"snippet_{i}.py"
         program.write_text(code.replace("n_steps=512", "n_steps=16").replace("100_000", "16"))
-        runpy.run_path(str(program))
+        made = runpy.run_path(str(program))
+    if page.stem == "README":
+        assert len(made["curves"]) == 8  # one trajectory
+    if page.stem == "rewards":
+        assert len(made["cost"]) == EpisodeSet(desk / "data" / "episodes").lengths[0]
+        assert (desk / "curves.png").exists()
+    if page.stem == "own_sensor":  # nothing is touched in the first tick
+        assert not made["touched"] and made["depth"].shape == (240, 320) and made["force"] < 1
     if page.stem == "own_task":
         episodes = EpisodeSet(desk / "my_episodes")
         assert [episodes.meta(i)["success"] for i in range(len(episodes))] == [True, True]

@@ -120,3 +120,11 @@ def test_an_episode_embedded_in_chunks_is_the_whole(embedder: EpisodeEmbedder) -
     for name, values in once.features.items():
         assert joined.features[name] == pytest.approx(values, abs=1e-5), name
     assert (joined.contact, len(joined)) == (once.contact, 20)
+    frames = {key: values for key, values in whole.frames.items() if key != TRUTH_CONTACT}
+    pressed = replace(whole, frames={key: values[7:] for key, values in frames.items()})
+    untouched = {key: frames[key][:5] for key in (TACTILE_LEFT, TACTILE_RIGHT)}
+    apart = embedder.embed_chunks([pressed], 20.0, "x", untouched)
+    assert apart.contact.frame == 0
+    for name, values in apart.features.items():
+        if name != "slip":  # counts from the first frame
+            assert values == pytest.approx(once.features[name][7:], abs=1e-5), name

@@ -18,7 +18,7 @@ from toy_episodes import FPS, assert_holds, make_episode, moving_blob, record
 
 from touchgoal.control import features as ft
 from touchgoal.control.sensors.clip import read_frames
-from touchgoal.episodes.format import set_files
+from touchgoal.episodes.format import encoding, set_files
 from touchgoal.episodes.format.encoding import encode
 from touchgoal.episodes.format.repair import repair, validate
 from touchgoal.episodes.media import write_video
@@ -38,6 +38,27 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_round_trip(recorded: Path) -> None:
     assert validate(recorded) == []
     assert_holds(recorded, [0, 1, 2], n=70)
+
+
+def test_a_long_episode_is_written_in_few_groups_and_little_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(encoding, "_MAX_ROW_GROUPS", 2)
+    episode, usual = make_episode(0, 100), pa.default_memory_pool()
+    pool = pa.proxy_memory_pool(usual)
+    noise = np.random.default_rng(0).integers(0, 256, (100, 160, 240, 3), np.uint8)
+    episode.frames[ft.TACTILE_LEFT] = noise  # 12 MB
+    pa.set_memory_pool(pool)
+    try:
+        EpisodeWriter(tmp_path, FPS).append(episode)
+    finally:
+        pa.set_memory_pool(usual)
+    file = pq.ParquetFile(tmp_path / set_files.data_path(0))
+    assert [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)] == [50, 50]
+    assert 0 < (pool.max_memory() or 0) < 4e6
+    read = EpisodeSet(tmp_path).read(0, frames=range(40, 60)).frames
+    for key, values in episode.frames.items():
+        np.testing.assert_array_equal(read[key], values[40:60], err_msg=key)
 
 
 def test_files_are_what_lerobot_reads(recorded: Path) -> None:

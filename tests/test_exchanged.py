@@ -85,6 +85,9 @@ def test_the_preflight_names_exchanged_and_touched_fingertips(tmp_path: Path) ->
     now = [render_untouched(unit, rng) for unit in units]
     lines = preflighted(now, files, tmp_path / "right")
     assert lines["fingertips"].ok and lines["tactile_left"].ok
+    assert "each looks like its own" in lines["fingertips"].detail
+    line = preflighted(now, files[:1] * 2, tmp_path / "one file")["fingertips"]
+    assert line.ok and "not checked" in line.detail
     lines = preflighted(now[::-1], files, tmp_path / "wrong")
     assert not lines["fingertips"].ok and "exchange fingertips.left" in lines["fingertips"].remedy
     now[0][100:140, 140:180] += 60

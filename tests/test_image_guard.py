@@ -95,7 +95,8 @@ def test_other_sensors_of_the_model_pass() -> None:
     rng = np.random.default_rng(0)
     for model in (GELSIGHT_MINI, GELSIGHT_MINI_MARKERS, DIGIT):
         for _ in range(8):
-            image = other_light(render_untouched(sample_instance(model, rng), rng))
+            unit = sample_instance(model, rng)
+            image = other_light(unit.with_dots(render_untouched(unit, rng)))
             for x, y in rng.integers(20, 220, (6, 2)):
                 cv2.circle(image, (int(x), int(y)), 3, (30, 25, 30), -1)
             check_untouched(image, model, "the image")
@@ -114,6 +115,16 @@ def balls(model: SensorModel) -> tuple[np.ndarray, list[np.ndarray]]:
     images = [shade(calibration, surface) for surface in surfaces]
     noisy = [(p + rng.normal(size=p.shape)).round().clip(0, 255).astype(np.uint8) for p in images]
     return noisy[0], noisy[1:]
+
+
+@pytest.mark.parametrize(
+    "model", [GELSIGHT_MINI, GELSIGHT_MINI_MARKERS, DIGIT], ids=lambda m: m.name
+)
+def test_a_press_is_no_untouched_image(model: SensorModel) -> None:
+    unit = sample_instance(model, np.random.default_rng(0), NO_RANDOMIZATION)
+    for press in balls(model)[1]:
+        with pytest.raises(UserError, match="begins in touch"):
+            check_unpressed(unit.with_dots(press), model, "the image")
 
 
 def test_presses_tell_a_mirror_that_the_untouched_gel_does_not_show(tmp_path: Path) -> None:

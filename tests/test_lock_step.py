@@ -17,7 +17,7 @@ from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.cell_file import EXAMPLES
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import connect_cell
-from touchgoal.control.cell.twin_client import connect_control_port, reset_scene
+from touchgoal.control.cell.twin_client import connect_control_port
 from touchgoal.control.interfaces import ArmReading
 from touchgoal.control.motion.tracker import ServoLag
 from touchgoal.control.safety.action_filter import ActionFilter
@@ -38,7 +38,6 @@ def swing(
     cell: CellConfig, pause: float, pause_images: Callable[[float], None] | None = None
 ) -> list[np.ndarray]:
     """Return all readings of each tick while the arm swings and the hand closes."""
-    reset_scene(cell.task.twin, cell.task.seed)
     connection, seen = connect_cell(cell, ft.CONTROL_HZ), []
     q = connection.arm.read().q
     for k in range(_TICKS):

@@ -102,9 +102,12 @@ def hold(cell: FakeCell, width: float, grasped: bool = False) -> None:
 class Fingertip(FakeFingertip):
     """An untouched one whose image flickers by a count from tick to tick."""
 
+    settles = 0.0  # s, in which its light doubles
+
     def read(self) -> Frame:
-        sequence = round(1000 * self.clock.time)
-        return Frame(self.image + np.uint8(sequence // 50 % 2), sequence, self.clock.time)
+        sequence, left = round(1000 * self.clock.time), max(0.0, self.settles - self.clock.time)
+        image = (self.image * (1 - 0.5 * left / max(self.settles, 1))).astype(np.uint8)
+        return Frame(image + np.uint8(sequence // 50 % 2), sequence, self.clock.time)
 
 
 def hand(width: float, asked: float, seconds: float = 2.0, creeping: float = 0.0) -> Ending:
@@ -242,6 +245,7 @@ def test_a_twin_below_95_percent_of_real_time_is_named(pace: float, tick: int, s
         ("tcp", 9.99e-3, 10.01e-3, "is it no FR3?"),  # m from where the controller has it
         ("rate", 24.0, 23.0, "23.0 images a second instead of 30"),
         ("counts", 11.9, 12.1, "looks touched (12 counts)"),
+        ("settles", 9.2, 9.8, "its light still changes after 10 s"),
         ("disk", 1.551e9, 1.549e9, "make room for 1.6 GB"),  # 500 MB, and 35 MB for each of 30 s
     ],
 )
@@ -252,7 +256,9 @@ def test_what_preflight_lets_pass(
     config = read_cell_file(write_cell_file(tmp_path, SIM + tips))
     monkeypatch.setattr(preflight, "require_readable", lambda *_: None)
     for value, refused in ((inside, False), (outside, True)):
-        given = {"rate": 30.0, "late": 0.0, "counts": 0.0, "disk": 1e12} | {what: value}
+        given = {"rate": 30.0, "late": 0.0, "counts": 0.0, "disk": 1e12, "settles": 0.0} | {
+            what: value
+        }
         cell = with_arm(late=given["late"])
         if what == "tcp":
             there, _ = KINEMATICS.forward(HOME)
@@ -261,6 +267,7 @@ def test_what_preflight_lets_pass(
             changed = value * np.eye(len(getattr(cell.arm.reading, what)))[2]
             cell.arm.reading = replace(cell.arm.reading, **{what: changed})
         cell.cameras = {key: Fingertip(cell.clock) for key in ft.TACTILE}
+        cell.cameras[ft.TACTILE[1]].settles = given["settles"]
         cell.cameras[ft.FRONT] = Paced(cell.clock, GEL, given["rate"])
         strength = np.array([given["counts"]])
         monkeypatch.setattr(preflight, "contact_strength", lambda *_, found=strength: found)

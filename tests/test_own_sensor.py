@@ -2,6 +2,7 @@
 
 import threading
 from contextlib import closing
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from rerun_rows import rerun_rows
 
 from touchgoal.control.calibration.ball import press_surface
+from touchgoal.control.calibration.check_report import figures, lines
 from touchgoal.control.calibration.press_recorder import PressRecorder
 from touchgoal.control.calibration.press_set import read_presses
 from touchgoal.control.calibration.sensor_check import check_sensor
@@ -23,11 +25,13 @@ from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import (
     GELSIGHT_MINI,
     GELSIGHT_MINI_MARKERS,
+    SENSORS,
     find_sensor,
 )
 from touchgoal.episodes.touches import touch_background
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.image_file import write_image
 from touchgoal.sim_envs.config import NO_RANDOMIZATION
 from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render_untouched
@@ -139,12 +143,26 @@ def balls() -> list[np.ndarray]:
 
 
 def test_the_start_of_a_clip_is_no_untouched_gel_by_itself(
-    balls: list[np.ndarray], capsys: pytest.CaptureFixture[str]
+    balls: list[np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Dark first frames are named and left out; a clip pressed in all its frames is told as that."""
     for pressed in balls[12:15]:
         with pytest.raises(UserError, match="the recording begins in touch"):
             check_sensor([pressed] * 20, GELSIGHT_MINI)
+    files = [tmp_path / "background.png", tmp_path / "clip" / "0.png", tmp_path / "clip" / "1.png"]
+    for path, frame in zip(files, (balls[0], *balls[12:14]), strict=True):
+        write_image(path, frame)
+    main(
+        [
+            "check-sensor",
+            str(tmp_path / "clip"),
+            "--background",
+            str(files[0]),
+            "--out",
+            str(tmp_path / "out"),
+        ]
+    )
+    assert "3, 2 of them touched" in capsys.readouterr().out
     dark = [(0.5 * frame).astype(np.uint8) for frame in balls[:5]]
     settling = [*dark, *balls]
     check = check_sensor(settling, GELSIGHT_MINI)
@@ -167,6 +185,11 @@ def test_a_sensor_check_reads_noise_ball_and_contact(balls: list[np.ndarray]) ->
     # The noise of one count is a part of the change, and no depth explains it.
     assert max(press.unexplained for press in check.presses) < 0.2
     assert not check.drift.large and not check.drift_from_file.large
+    computed = check_sensor(balls, replace(GELSIGHT_MINI, measured=False), ball_radius=4e-3)
+    assert computed.touching == 3 and not computed.presses and not computed.presses_unexplained
+    printed = "\n".join(lines(computed, figures(computed, 4.0, None)))
+    assert "images only" in printed and "force  " not in printed and "ball  " not in printed
+    assert [name for name in SENSORS if SENSORS[name].images_only] == ["gelsight_wedge"]
 
 
 def test_check_sensor_says_what_is_off(
@@ -188,7 +211,7 @@ def test_check_sensor_says_what_is_off(
     assert "lock the exposure" in printed and "record-presses" in printed
     assert "under a weight of 19.6 N: multiply" in printed
     drawn = cv2.imread(str(tmp_path / "out" / "check.png"))
-    assert drawn is not None and drawn.shape == (3 * 240, 5 * 320, 3)
+    assert drawn is not None and drawn.shape == (24 + 3 * 240, 5 * 320, 3)
 
 
 def test_a_sensor_check_counts_markers() -> None:

@@ -38,6 +38,7 @@ from touchgoal.policies.sight.frozen_images import ImageEmbedder, ImageInputConf
 from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.policies.training.training_data import choose_episodes, common_sensor, find_task
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.cell.deployment import DeploymentConfig
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.tasks import make_env
@@ -184,10 +185,11 @@ def test_a_stop_while_embedding_costs_one_episode(tmp_path: Path) -> None:
 
 
 def test_what_comes_next_has_the_options_of_the_task() -> None:
-    env = PickPlaceConfig(objects=("wooden_block",), cameras=(), tactile=False)
-    _, twin = read_options("twin", shlex.split(_changed_options(RunPolicy(env=env))))
-    assert twin.env.objects == env.objects and not twin.env.tactile and not twin.env.cameras
-    assert not _changed_options(RunPolicy())
+    late = DeploymentConfig(image_delay=(0.0, 0.05))
+    env = PickPlaceConfig(objects=("wooden_block",), cameras=(), tactile=False, deployment=late)
+    _, twin = read_options("twin", shlex.split(_changed_options(env, RunPolicy.env)))
+    assert replace(twin.env, camera_size=env.camera_size) == env
+    assert not _changed_options(RunPolicy.env, RunPolicy.env)
 
 
 @pytest.mark.parametrize(

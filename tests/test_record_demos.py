@@ -9,6 +9,7 @@ import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ from touchgoal.control.teleoperation.yielding import YieldingHand
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch import record_demos
 from touchgoal.launch.deploy import NOT_DONE
+from touchgoal.launch.support import confirm
 from touchgoal.runtime.errors import UserError
 
 OBSERVED: dict = {}
@@ -182,9 +184,11 @@ def test_own_demonstrations_train_a_policy_that_deploys(
     """At toy size: nothing is any good, and nothing knows more than the cell's sensors."""
     cell, down = write_cell_file(tmp_path, CELL), [0, 0, -0.5, 0, 0, 0]
     monkeypatch.setattr(record_demos, "_open_device", lambda *_: Pushed(down, ticks=20))
+    monkeypatch.setattr(confirm, "confirm", confirmed := MagicMock())
     for name, seed, episodes in (("train", 0, 2), ("validation", 100_000, 1)):
         run("record-demos", cell, "--device", "scripted", "--episodes", episodes, "--seed", seed,
-            "--yes", "--out", tmp_path / name)  # fmt: skip
+            "--out", tmp_path / name)  # fmt: skip
+    assert [len(call.args) for call in confirmed.call_args_list] == [2, 2]  # with the fingertips
     found = EpisodeSet(tmp_path / "train" / "episodes")
     assert len(found) == 2 and not any(key.startswith("truth.") for key in found.features)
     frames, meta = found.read(0).frames, found.meta(0)

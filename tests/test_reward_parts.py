@@ -230,8 +230,9 @@ def test_a_press_is_read_where_and_how_hard_it_is() -> None:
     readings = ContactReader(SENSORS["gelsight_mini"], frames[:5], 20.0).read(frames)
     assert readings["held"].tolist() == [False] * 6 + [True] * 3 and len(readings["centre"]) == 9
     assert readings["force"][:6].tolist() == [0] * 6 and readings["force"][-1] > 0
-    blind = ContactReader(None, frames[:5], 20.0).read(frames)
-    assert blind.keys() == {"held"} and blind["held"].tolist() == readings["held"].tolist()
+    for unmeasured in (None, replace(SENSORS["gelsight_mini"], measured=False)):
+        blind = ContactReader(unmeasured, frames[:5], 20.0).read(frames)
+        assert blind.keys() == {"held"} and blind["held"].tolist() == readings["held"].tolist()
 
 
 def test_ends_are_a_goal_chosen_by_object(successes: list[EmbeddedEpisode], tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -19,7 +18,8 @@ from test_success import facts
 from toy_towers import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
-from touchgoal.episodes.film import curve_colors
+from touchgoal.control.sensors.clip import read_frames
+from touchgoal.episodes.film import write_film
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
@@ -30,7 +30,7 @@ from touchgoal.rewards.goals import Bank, OwnFrame
 from touchgoal.rewards.measure import Measurement, embed_here, write_skipped
 from touchgoal.rewards.metrics import measure_curve
 from touchgoal.rewards.report.page import write_pages
-from touchgoal.rewards.report.plot import line_styles, plot
+from touchgoal.rewards.report.plot import CURVES, curve_colors, line_styles, plot
 from touchgoal.rewards.report.record import Record, load_facts, record_of
 from touchgoal.rewards.report.report import report_all
 from touchgoal.rewards.report.tables import ends_table, metrics_table, outcome_table
@@ -40,6 +40,7 @@ from touchgoal.rewards.sources import trajectory
 from touchgoal.rewards.sources.episode_trajectories import default_goals
 from touchgoal.rewards.sources.open_source import open_source
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.image_file import write_image
 
 EPISODE = recorded()
 REWARD = Reward("last", towers=PaintTowers())
@@ -134,6 +135,16 @@ def test_videos_are_found_by_their_names(tmp_path: Path, monkeypatch: pytest.Mon
     assert set(chunk.frames) == {FRONT, TACTILE_LEFT} and chunk.frames[FRONT].shape == front.shape
     one = open_source(folder / "a2.mp4", "wrist").inputs
     assert (one.camera, one.sides) == (WRIST, (TACTILE_LEFT,))
+    gels = [
+        write_image(tmp_path / f"{n}.png", touch[0, :n]) or tmp_path / f"{n}.png"
+        for n in (240, 120)
+    ]
+    apart = open_source(folder, "front", background=gels[:1]).trajectories[0]
+    np.testing.assert_array_equal(apart.untouched[TACTILE_LEFT], touch[:1])
+    assert apart.checksum() != source.trajectories[0].checksum()
+    for wrong, says in ((gels[1:], r"\(120, 320\)"), (gels, "its videos")):
+        with pytest.raises(UserError, match=says):
+            open_source(folder / "a2.mp4", "front", background=wrong)
     line = write_skipped(source.skipped, 5, tmp_path)
     assert line.startswith("2 of 5 skipped") and "c," in (tmp_path / "skipped.csv").read_text()
 
@@ -217,21 +228,26 @@ def test_printed_tables_are_short_and_name_the_objects() -> None:
     assert [line.split()[0] for line in table.splitlines()[2:8]] == ["curve", "fused", *"abcd"]
     assert "2 more curves" in table and "lag" not in table and "undefined" not in table
     ends = ends_table(some)
-    assert (
-        ends.splitlines()[2].split()[:3] == ["x", "x", "0.00"]
-        and "describe some of them only" in ends
-    )
+    assert ends.splitlines()[2].split()[:3] == ["x", "x", "0.00"]
+    assert "describe some of them only" in ends
     assert "describe" not in ends_table([replace(one, object="cup") for one in some])
 
 
 def test_a_curve_has_one_colour_and_a_lone_one_is_solid() -> None:
     alone, beside = line_styles(["image"]), line_styles(["image", "tactile", "image+tactile"])
-    colors = curve_colors(["fused", "front", "image"])  # of films, too
-    assert alone["image"]["color"] == beside["image"]["color"] == colors["image"]
+    assert alone["image"]["color"] == beside["image"]["color"] == CURVES["image"]  # of films, too
+    assert len({*curve_colors(["front", "top", "side"]).values()}) == 3  # a camera has what is left
     curve = {"image": np.linspace(1, 0, 9)}
     figure = plot(Curves("a", {}, 20.0, Contact(None, "no touch"), curve, {}), about="cup, drop")
-    assert figure.texts[0].get_text() == "a · cup, drop"
-    assert alone["image"]["linestyle"] == "-" and colors["fused"] == "#000000"
+    assert [text.get_text() for text in figure.texts] == ["a · cup, drop", "image · goal: "]
+    assert figure.axes[0].get_position().x1 > 0.95  # beside it there are no names
+    assert alone["image"]["linestyle"] == "-"
+
+
+def test_a_film_ends_with_its_curves(tmp_path: Path) -> None:
+    images, curve = np.zeros((6, 240, 400, 3), np.uint8), {"fused": np.ones(7)}
+    write_film(tmp_path / "a.mp4", images, EPISODE, 20, curve)
+    assert len(read_frames(tmp_path / "a.mp4")[0]) == 4
 
 
 def test_tables_for_lerobot(episodes: Path, tmp_path: Path) -> None:
@@ -281,48 +297,17 @@ def pages(episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ca
 def test_page_holds_everything(pages: Callable[..., Path]) -> None:
     page = pages(100)
     data = data_of(page)
-    assert data["colors"] == curve_colors(["image"]) and data["unit"] == "cosine distance to goal"
+    assert data["unit"] == "cosine distance to goal"
+    assert data["styles"]["image"]["color"] == CURVES["image"]
     assert addresses(page) == [] and "&lt;b&gt;" in page.read_text()
     assert [e["outcome"] for e in data["episodes"]] == ["success", "success", "drop", "success"]
     first = data["episodes"][0]
     assert len(first["curves"]["image"]) == 12 and first["shown"] == list(range(12))
     sheet = first["sheets"]["front"]
-    assert (sheet["columns"], sheet["width"], sheet["height"]) == (8, 96, 96)
+    assert (sheet["columns"], sheet["width"], sheet["height"]) == (8, 32, 32)
     index = pages(3)
     names = ["report.html", "report_001.html", "report_002.html"]
     assert addresses(index) == names
     assert "curves" not in data_of(index)["episodes"][0]
     assert data_of(index)["episodes"][3]["page"] == "report_002.html#episode_003"
     assert len(data_of(index.with_name("report_002.html"))["episodes"]) == 1
-
-
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-ACTIONS = """
-<script>
-const key = (name) => document.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));
-key("ArrowLeft");
-const scrubbed = byId("time").textContent;
-key("ArrowDown");
-[...document.querySelectorAll("th")].find((cell) => cell.textContent === "outcome").click();
-const rows = [...byId("table").tBodies[0].rows].map((row) => row.dataset.name);
-document.title = JSON.stringify({scrubbed, chosen: byId("name").textContent, rows,
-  paths: document.querySelectorAll("#chart path").length});
-</script>
-"""
-
-
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium on the path")
-def test_page_in_a_browser(pages: Callable[..., Path], tmp_path: Path) -> None:
-    page = pages(100)
-    acted = tmp_path / "acted.html"
-    acted.write_text(page.read_text().replace("</body>", f"{ACTIONS}</body>"))
-    command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
-    profile = f"--user-data-dir={tmp_path / 'profile'}"
-    done = subprocess.run(
-        [*command, profile, acted.as_uri()], capture_output=True, text=True, timeout=120
-    )
-    found = re.search(r"<title>(.*?)</title>", done.stdout)
-    assert found, done.stderr
-    result = json.loads(found[1].replace("&quot;", '"'))
-    assert result["scrubbed"].endswith("frame 10") and result["chosen"] == "set#1"
-    assert result["rows"][0] == "episode_002" and result["paths"] >= 1

@@ -130,6 +130,16 @@ def test_the_grid_is_ordered_however_it_lies(
     assert np.abs(markers.positions.reshape(-1, 2) - expected).max() < 0.3
 
 
+@pytest.mark.parametrize(("rows", "columns", "pitch"), [(5, 7, 44), (6, 8, 36), (11, 15, 21)])
+def test_another_grid_is_found_in_the_image(rows: int, columns: int, pitch: float) -> None:
+    image, cells = untouched(MINI, 1)[0], np.indices((rows, columns))[::-1].reshape(2, -1).T
+    dots = (cells + 0.5) * pitch + np.array([4.3, 7.6])
+    draw(image, dots.astype(np.float32), 0.23 * pitch)
+    markers = find_markers(image, DOTS, MINI.pixel_pitch)
+    assert markers.found.shape == (rows, columns) and markers.found.all()
+    assert np.abs(markers.positions.reshape(-1, 2) - dots).max() < 0.3
+
+
 def test_a_gel_without_its_markers_is_refused() -> None:
     plain = untouched(MINI, 1)[0]
     lonely = plain.copy()

@@ -13,9 +13,9 @@ import pytest
 import serial
 from running_twin import RunningTwin, client
 
+from touchgoal.control.cell.connection import connect_cell
 from touchgoal.control.cell.twin_client import lease_twin
 from touchgoal.control.sensors.load_cell import parse
-from touchgoal.launch.support import cell_run
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.twin.mjpeg import Stream
@@ -182,7 +182,7 @@ def test_one_deployment_at_a_time_uses_a_twin(fr3: RunningTwin) -> None:
     with lease_twin(fr3.cell.task.twin):
         before = fr3.ask("truth")["layout"]["goal"]
         with pytest.raises(UserError, match="another deploy uses this twin"):
-            cell_run.connect(fr3.cell)  # of another seed: it would put the scene back
+            connect_cell(fr3.cell, 20)  # of another seed: it would put the scene back
         assert fr3.ask("truth")["layout"]["goal"] == before
     lease_twin(fr3.cell.task.twin).close()
 

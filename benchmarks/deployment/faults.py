@@ -84,6 +84,7 @@ CASES = (
     FaultCase("link frozen 2 s", "freeze 2"),
     FaultCase("camera stalled", "stall front 60"),
     FaultCase("camera frozen on a frame", "repeat front 60"),
+    FaultCase("fingertip frozen", "repeat tactile_left 60"),
     FaultCase("fingertip: wrong bytes", "break tactile_left 60"),
     FaultCase("fingertip: half pictures", "halve tactile_left 60"),
     FaultCase("speeds are no numbers", "nonsense on"),

@@ -1,6 +1,6 @@
 """Contact and force on real grasps with a load cell, on objects outside the calibration."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -60,14 +60,12 @@ def run(config: Config) -> dict[str, Any]:
 def judge_depth(grasps: list[ForceGrasp]) -> dict[str, float]:
     """Return for each grasp the rank correlation of force from depth with the load cell, in contact.
 
-    It is the force that a reward's force part compares; it needs no calibration on a load cell.
+    It is the force that a reward's force part would compare were the file measured; it needs no calibration on a load cell.
     """
-    ranks = {}
+    ranks, wedge = {}, replace(GELSIGHT_WEDGE, measured=True)  # read as if it were
     for grasp in track(grasps, "reading depth", "grasp"):
         frames = grasp.frames()
-        readings = ContactReader(GELSIGHT_WEDGE, frames[:_FIRST], GELSIGHT_WEDGE.frame_rate).read(
-            frames
-        )
+        readings = ContactReader(wedge, frames[:_FIRST], GELSIGHT_WEDGE.frame_rate).read(frames)
         force = grasp.force[: len(frames)]
         in_contact = readings["held"] & (np.abs(force) < _IMPOSSIBLE)
         ranks[grasp.trial] = spearman(readings["force"][in_contact], force[in_contact])

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from touchgoal.control.arrays import Image
+from touchgoal.control.calibration.report import heading
 from touchgoal.control.calibration.sensor_check import PressReading, SensorCheck
 from touchgoal.control.tactile.background import Drift
 from touchgoal.control.tactile.contact import coarse
@@ -15,6 +16,7 @@ from touchgoal.control.tactile.image_guard import UNEXPLAINED
 
 _SHOWN = 4  # presses in the image
 _CONTRAST = 4  # factor on the change in its column
+_COLUMNS = ("frame", "simulated", f"change x {_CONTRAST}", "the same, simulated", "depth")
 _GRAVITY = 9.81  # m/s^2
 _MARGIN = 2.0  # times the threshold that a usual touch should have
 _UNLIKE = 5.0  # counts of local change; the usual drift between real touches gives 3
@@ -55,7 +57,7 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
         _light("drift", check.drift, "lock the exposure, and let the sensor warm up"),
         _light("sensor file", check.drift_from_file, "calibrate this sensor"),
     ]
-    if check.unlike_file > _UNLIKE:
+    if check.unlike_file > _UNLIKE and not check.images_only:
         printed.append(
             "             the untouched gel differs from the sensor file's by "
             f"{check.unlike_file:.1f} counts in one spot: depths and forces are nominal until this "
@@ -65,6 +67,8 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
     if check.markers is not None:
         shift = f"moved by up to {check.largest_shift_px:.1f} px"
         printed.append(f"markers      {100 * check.markers:.0f} % found, {shift}")
+    if check.images_only:
+        printed.append(f"images only  {check.images_only}")
     if refused := check.presses_unexplained:
         printed.append(
             f"refused      {refused} of {refused + len(check.presses)} presses: the sensor file "
@@ -87,7 +91,8 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
 def image(check: SensorCheck) -> UInt8[np.ndarray, "H W 3"]:
     """Draw one row per press: frame, simulated frame, change of each times 4 about grey, depth."""
     rows = [_row(press, check.background) for press in check.presses[:_SHOWN]]
-    return np.vstack(rows or [np.hstack([check.background] * 2)])
+    head = heading(_COLUMNS if rows else ("untouched",), check.background.shape[1])
+    return np.vstack([head, *(rows or [check.background])])
 
 
 def _ball(figures: dict[str, Any]) -> str:
@@ -123,7 +128,8 @@ def _row(press: PressReading, background: Image) -> np.ndarray:
     if press.circle is not None and press.ball is not None:
         x, y, radius = press.circle.round().astype(int).tolist()
         cv2.circle(drawn, (x, y), radius, white, 1, cv2.LINE_AA)
-    cv2.putText(depth, f"{1e3 * deepest:.2f} mm", (8, 20), font, 0.5, white, 1, cv2.LINE_AA)
+    text = f"deepest {1e3 * deepest:.2f} mm, {press.force:.1f} N"
+    cv2.putText(depth, text, (8, 20), font, 0.5, white, 1, cv2.LINE_AA)
     return np.hstack([press.frame, press.drawn, drawn, simulated, depth])
 
 

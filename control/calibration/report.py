@@ -197,12 +197,16 @@ def side_by_side(
     tiles += [np.full_like(tiles[0], _PAPER)] * (-len(tiles) % _PAIRS_PER_ROW)
     rows = [np.hstack(tiles[i : i + _PAIRS_PER_ROW]) for i in range(0, len(tiles), _PAIRS_PER_ROW)]
     width = tiles[0].shape[1] // 3
-    heading = np.full((24, rows[0].shape[1], 3), _PAPER, np.uint8)
-    for i, text in enumerate(
-        ("measured", "simulated", f"difference x{_CONTRAST}") * _PAIRS_PER_ROW
-    ):
-        _write(heading, text, (i + 0.5) * width, 12, _INK)
-    return np.vstack([heading, *rows])
+    texts = ("measured", "simulated", f"difference x{_CONTRAST}") * _PAIRS_PER_ROW
+    return np.vstack([heading(texts, width), *rows])
+
+
+def heading(texts: Sequence[str], width: int) -> UInt8[np.ndarray, "24 W 3"]:
+    """Draw the names of columns of images of that width (px)."""
+    image = np.full((24, len(texts) * width, 3), _PAPER, np.uint8)
+    for i, text in enumerate(texts):
+        _write(image, text, (i + 0.5) * width, 12, _INK)
+    return image
 
 
 def light_compass(calibration: SensorCalibration) -> UInt8[np.ndarray, "320 320 3"]:

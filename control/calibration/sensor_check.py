@@ -69,6 +69,7 @@ class SensorCheck:
     largest_shift_px: float  # of a marker from its rest position, px
     presses: list[PressReading]  # firm ones that the sensor file explains
     presses_unexplained: int  # number of firm ones that it does not explain
+    images_only: str  # why depths and forces were not read; "" if they were
     background: Image  # the untouched sensor at the end
 
 
@@ -134,7 +135,8 @@ def check_sensor(
     plain = dots.painted(untouched_now, at_rest=True)
     aligned = [_on_background(touch, plain) for touch in firm]
     image_guard.check_presses(plain, aligned, sensor, "the frames in contact")
-    readings = _read(firm, sensor, calibration, ball_radius)
+    read = [] if sensor.images_only else firm
+    readings = _read(read, sensor, calibration, ball_radius)
     explained = [reading for reading in readings if reading.unexplained <= image_guard.UNEXPLAINED]
     return SensorCheck(
         frames=len(untouched) + len(touches) + torn,
@@ -151,6 +153,7 @@ def check_sensor(
         largest_shift_px=dots.largest_shift,
         presses=explained,
         presses_unexplained=len(readings) - len(explained),
+        images_only=sensor.images_only,
         background=untouched_now,
     )
 

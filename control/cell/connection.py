@@ -4,7 +4,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from socket import socket
@@ -14,20 +14,21 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.arms import franka, ur
+from touchgoal.control.arms.driver_process import error_line
 from touchgoal.control.arms.streaming import ArmConfig, ArmProcess
 from touchgoal.control.cell.config import CameraName, CellConfig, FingertipsSection
 from touchgoal.control.cell.limits import cell_limits
-from touchgoal.control.cell.twin_client import LockStepClock, ask_twin
+from touchgoal.control.cell.twin_client import LockStepClock, ask_twin, lease_twin, reset_scene
 from touchgoal.control.grippers.franka_hand import FrankaHand, NonBlockingGripper
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
-from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell
+from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell, TactileSensor
 from touchgoal.control.safety.limits import RobotLimits
 from touchgoal.control.sensors.fingertip_source import fingertip_video
 from touchgoal.control.sensors.load_cell import SerialLoadCell
 from touchgoal.control.sensors.tactile_camera import TactileCamera, fingertip_view
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.runtime.errors import CheckResult, UserError, require_all_ok
+from touchgoal.runtime.errors import CheckResult, require_all_ok
 
 # Hz, and s of wall time without an image: slow enough for any loaded machine.
 _LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 0.1, 10.0
@@ -116,34 +117,50 @@ class CellConnection:
     truth: Callable[[], dict[str, Any]] | None = None
     lease: socket | None = None  # of the twin; others may use it once this is closed
 
+    @property
+    def fingertips(self) -> dict[str, TactileSensor]:
+        """Those of the cameras that are fingertips."""
+        return {key: c for key, c in self.cameras.items() if isinstance(c, TactileSensor)}
+
     def close(self) -> None:
         """Close the arm first; a device that fails to close is named, and holds up nothing."""
         clock = self.clock if isinstance(self.clock, LockStepClock) else None
         devices = (self.arm, self.gripper, *self.cameras.values(), self.load_cell)
         for device in (clock, *devices, self.lease):
-            try:
-                if device is not None:
-                    device.close()
-            except Exception as error:  # of any driver
-                print(f"{type(device).__name__} did not close: {error}", file=sys.stderr)
+            _close(device)
+
+
+def _close(device: Any) -> None:
+    try:
+        if device is not None:
+            device.close()
+    except Exception as error:  # of any driver
+        print(f"{type(device).__name__} did not close: {error}", file=sys.stderr)
 
 
 def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellConnection:
     """Connect to everything in a cell with a real arm or a twin; commands will come at `hz`.
 
-    A lock-step twin begins the episode of `task.seed`, or goes on with its own if not `new_episode`.
-    UserError names all devices that do not open, after a row for each; the others are released.
+    A twin is taken until the connection closes. It first puts the scene of `task.seed` back, or goes on
+    with its own if not `new_episode`. UserError: another program has the twin; or devices do not open,
+    all of which are named, after a row for each. The others are released, the last opened first.
+    Nothing has moved then, so there is no run and no ending.
     """
     robot, rows = cell_limits(cell), list[CheckResult]()
     with ExitStack() as undo:
+        lease = undo.enter_context(lease_twin(cell.task.twin)) if cell.task.twin else None
+        if lease and new_episode:
+            reset_scene(cell.task.twin, cell.task.seed)
+            print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
 
         def opened(name: str, open_device: Callable[[], Any]) -> Any:
             try:
-                device = undo.enter_context(closing(open_device()))
-                rows.append(CheckResult(name, True, "opened"))
-            except UserError as error:
-                device = None
-                rows.append(CheckResult(name, False, "", str(error)))
+                device = open_device()
+            except Exception as error:  # of any driver
+                rows.append(CheckResult(name, False, "", error_line(error)))
+                return None
+            rows.append(CheckResult(name, True, "opened"))
+            undo.callback(_close, device)
             return device
 
         cameras: dict[str, Camera] = {
@@ -169,7 +186,7 @@ def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellC
             clock = ArmClock(arm)
         undo.pop_all()
     truth = partial(ask_twin, cell.task.twin, "truth") if cell.task.twin else None
-    return CellConnection(robot, arm, gripper, cameras, load_cell, clock, truth)
+    return CellConnection(robot, arm, gripper, cameras, load_cell, clock, truth, lease)
 
 
 def camera_formats(cell: CellConfig) -> dict[str, tuple[float, int, int]]:

@@ -15,7 +15,6 @@ from touchgoal.control.interfaces import (
     Frame,
     GripperReading,
     LoadReading,
-    TactileSensor,
 )
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_vector
@@ -58,7 +57,7 @@ class ObservationReader:
                 )
         robot = connection.robot
         self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
-        tips = {k: c for k, c in connection.cameras.items() if isinstance(c, TactileSensor)}
+        tips = connection.fingertips
         for key, tip in tips.items():
             if wrong := image_fault(tip.read().image, tip.model):
                 raise UserError(f"{key.removeprefix(ft.IMAGE_PREFIX)}: {wrong}")

@@ -21,10 +21,11 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.fingertip_health import FingertipHealth
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.control.sensors.exchanged import fingertips_exchanged
+from touchgoal.control.tactile.background import settling
 from touchgoal.control.tactile.contact import coarse, contact_strength, threshold_for
 from touchgoal.control.tactile.image_guard import check_untouched
 from touchgoal.control.tactile.indentation import require_readable
-from touchgoal.control.tactile.markers.tracker import find_markers, without_markers
+from touchgoal.control.tactile.markers.tracker import without_dots
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime.errors import CheckResult, UserError
@@ -33,7 +34,11 @@ _MIN_RATE_SHARE = 0.8  # share of the camera rate that the cell file states
 # Counts by which a fingertip may differ from its sensor file's. Simulated units differ by 1 to 2, a
 # grasp makes 20 and more; real units differ by more than simulated ones (unmeasured here).
 _TOUCHED_COUNTS = 12.0
-_WATCH_SECONDS = 1.0  # s for which cameras are watched
+_WATCH_SECONDS = 1.0  # s for which cameras are watched, again and again while an exposure settles
+_SETTLED, _SETTLES_WITHIN = (
+    0.03,
+    10.0,
+)  # change of a channel's light in that time, a share; s, at most
 # mm between tools by nominal and by the controller's kinematics: a UR's own calibration makes 1 to 2
 _CALIBRATED, _OTHER_ARM = 1.0, 10.0
 _WATCH_INTERVAL = 0.05  # s between two looks at the fingertips
@@ -73,7 +78,7 @@ def preflight(
     for key, camera in connection.cameras.items():
         check = partial(_camera, camera, rates[key], nominal[key], tips_seen.get(key, []))
         checks.append((key.removeprefix(ft.IMAGE_PREFIX), check))
-    if tips and tips.sensor_files:
+    if tips:
         checks.append(("fingertips", lambda: _fingertips(connection)))
     if connection.load_cell:
         checks.append(("load cell", lambda: _load_cell(connection)))
@@ -86,29 +91,38 @@ def preflight(
 
 
 def watch_cameras(connection: CellConnection) -> tuple[dict[str, float], dict[str, list[Image]]]:
-    """Return the rate of each camera (Hz), by the connection's clock, and each fingertip's frames."""
-    clock, begin = connection.clock, connection.clock.now()
-    before = _sequences(connection)
-    found: dict[str, dict[int, Image]] = {}
-    while clock.now() < begin + _WATCH_SECONDS - 1e-9:
-        clock.wait(min(clock.now() + _WATCH_INTERVAL, begin + _WATCH_SECONDS))
+    """Return the rate of each camera (Hz), by the connection's clock, and each fingertip's frames.
+
+    They are those of one second, when the light of all fingertips is steady or 10 s are over.
+    """
+    clock = connection.clock
+    latest = clock.now() + _SETTLES_WITHIN - _WATCH_SECONDS + 1e-6
+    while any(map(_settles, (watched := _watch_once(connection))[1].values())):
+        if clock.now() > latest:
+            break
+    return watched
+
+
+def _settles(frames: list[Image]) -> bool:
+    return len(frames) > 1 and settling(frames[0], frames[-1], _SETTLED)
+
+
+def _watch_once(connection: CellConnection) -> tuple[dict[str, float], dict[str, list[Image]]]:
+    clock, begin, seconds = connection.clock, connection.clock.now(), 0.0
+    sequences: dict[str, list[int]] = {key: [] for key in connection.cameras}
+    found: dict[str, dict[int, Image]] = {key: {} for key in connection.fingertips}
+    while True:
         for key, camera in connection.cameras.items():
-            if isinstance(camera, TactileSensor):
-                with suppress(Exception):  # of any driver; the camera's own check says so
-                    frame = camera.read()
-                    found.setdefault(key, {})[frame.sequence] = frame.image
-    after, seconds = _sequences(connection), clock.now() - begin
-    rates = {key: (after[key] - before[key]) / seconds for key in after}
+            with suppress(Exception):  # of any driver; the camera's own check says so
+                frame = camera.read()
+                sequences[key].append(frame.sequence)
+                if key in found:
+                    found[key][frame.sequence] = frame.image
+        if (seconds := clock.now() - begin) > _WATCH_SECONDS - 1e-9:
+            break
+        clock.wait(min(clock.now() + _WATCH_INTERVAL, begin + _WATCH_SECONDS))
+    rates = {key: (n[-1] - n[0]) / seconds if n else 0.0 for key, n in sequences.items()}
     return rates, {key: list(frames.values()) for key, frames in found.items()}
-
-
-def _sequences(connection: CellConnection) -> dict[str, int]:
-    """Return the number of images each camera has taken; 0 for a broken one."""
-    counts = dict.fromkeys(connection.cameras, 0)
-    for key, camera in connection.cameras.items():
-        with suppress(Exception):  # of any driver; the camera's own check says so
-            counts[key] = camera.read().sequence
-    return counts
 
 
 def _run_check(what: str, check: Callable[[], str]) -> CheckResult:
@@ -210,6 +224,11 @@ def _camera(camera: Camera, rate: float, nominal: float, frames: list[Image]) ->
         for wrong in (health.update(frame) for frame in frames):
             if wrong:
                 raise UserError(wrong)
+        if _settles(frames):
+            raise UserError(
+                f"its light still changes after {_SETTLES_WITHIN:g} s: lock its exposure "
+                "(fingertips.exposure in the cell file), or let its lamps warm up"
+            )
         frames = frames or [camera.read().image]
         middle = np.median(frames, axis=0).astype(np.uint8)
         if wrong := coarse(threshold_for(np.stack(frames), middle)):
@@ -234,26 +253,22 @@ def _camera(camera: Camera, rate: float, nominal: float, frames: list[Image]) ->
 
 def _fingertip(camera: TactileSensor) -> tuple[Image, Image]:
     """Return a fingertip's image and its sensor file's background, both without dots."""
-    frame, model = camera.read().image, camera.model
-    if model.markers is not None:  # the dots' places differ from unit to unit
-        dots = find_markers(frame, model.markers, model.pixel_pitch)
-        frame = without_markers(frame, dots.positions, dots.largest_radius(model.markers))
-    return frame, load(model.sensor_file).background
+    model = camera.model
+    return without_dots(camera.read().image, model), load(model.sensor_file).background
 
 
 def _fingertips(connection: CellConnection) -> str:
-    """Check that each fingertip looks like its own sensor file."""
-    left, right = (
-        _fingertip(camera)
-        for key in ft.TACTILE
-        if isinstance(camera := connection.cameras[key], TactileSensor)
-    )
-    if fingertips_exchanged((left[0], right[0]), (left[1], right[1])):
+    """Check that each fingertip looks like its own sensor file, where the two files tell them apart."""
+    left, right = (_fingertip(connection.fingertips[key]) for key in ft.TACTILE)
+    frames = left[0], right[0]
+    if fingertips_exchanged(frames, (left[1], right[1])):
         raise UserError(
             "they look exchanged, each like the other's sensor file: exchange fingertips.left and "
             "fingertips.right in the cell file, or the two sensors"
         )
-    return "neither looks like the other's sensor file"
+    if fingertips_exchanged(frames, (right[1], left[1])):  # which holds, the other way round
+        return "each looks like its own sensor file"
+    return "left and right not checked: their sensor files do not tell them apart"
 
 
 def _load_cell(connection: CellConnection) -> str:

@@ -164,10 +164,10 @@ class Session:
     def _camera_images(self) -> dict[str, Image]:
         """Return the newest image of front and wrist camera, in this order, of those that work."""
         images = {}
-        for key, camera in self.connection.cameras.items():
-            with suppress(Exception):  # the loop's next tick names it
-                images[key] = camera.read().image
-        return {key: images[key] for key in ft.CAMERAS if key in images}
+        for key in ft.CAMERAS:
+            with suppress(Exception):  # there is none, or the loop's next tick names it
+                images[key] = self.connection.cameras[key].read().image
+        return images
 
     def _success(self, ending: Ending) -> bool | None:
         """Return the outcome; a run that was stopped is no success, whatever the task looks like."""

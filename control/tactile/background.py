@@ -112,7 +112,7 @@ def first_steady(frames: Images, name: str = "") -> int:
     first = 0
     if len(frames) >= SETTLES_WITHIN:
         later = frames[SETTLES_WITHIN - 1]
-        while first < SETTLES_WITHIN - _START and _settling(frames[first], later):
+        while first < SETTLES_WITHIN - _START and settling(frames[first], later):
             first += 1
     if first and name:
         left_out = f"frames 0 to {first - 1} are left out of the untouched image"
@@ -120,10 +120,10 @@ def first_steady(frames: Images, name: str = "") -> int:
     return first
 
 
-def _settling(frame: Image, later: Image) -> bool:
-    """Return whether the light, and nothing else, differs from a later frame's."""
+def settling(frame: Image, later: Image, least: float = LARGE_CHANGE) -> bool:
+    """Return whether the light, and nothing else, differs from a later frame's by a share of `least`."""
     gain = light_gain(frame, later)
-    if (np.abs(gain - 1) < LARGE_CHANGE).all():
+    if (np.abs(gain - 1) < least).all():
         return False
     return float(local_change(divide_gain(frame, gain), later).max()) < _SAME_SHAPE
 

@@ -89,8 +89,11 @@ def contact_strength(frames: Images, background: Image) -> Float32[np.ndarray, "
 def threshold_for(untouched: Images, background: Image) -> float:
     """Return the contact threshold (counts) for a sensor with the noise of these frames.
 
-    Compressed streams have a strength of 1 to 2. Fewer than half of the frames may be in contact.
+    Compressed streams have a strength of 1 to 2. Fewer than half of the frames may be in contact. A
+    single one shows no noise: 5 counts.
     """
+    if len(untouched) == 1:
+        return _LEARNING_THRESHOLD
     return max(THRESHOLD, _SPARE * float(np.median(contact_strength(untouched, background))))
 
 

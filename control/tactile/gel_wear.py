@@ -13,7 +13,7 @@ import numpy as np
 from touchgoal.control.arrays import Image
 from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.light_gain import remove_gain
-from touchgoal.control.tactile.markers.tracker import find_markers, without_markers
+from touchgoal.control.tactile.markers.tracker import without_dots
 from touchgoal.control.tactile.sensor_models import SensorModel
 
 # Strength of a change: counts, and multiple of the image's median. Between untouched images of one
@@ -51,7 +51,7 @@ def find_wear(untouched: Image, first: Image, sensor: SensorModel) -> GelWear | 
 
     Dots are painted over. UserError if a gel with dots shows none.
     """
-    now, before = (_without_dots(image, sensor) for image in (untouched, first))
+    now, before = (without_dots(image, sensor) for image in (untouched, first))
     change = local_change(remove_gain(now, before), before)
     rows, columns = change.shape
     inner = np.zeros_like(change)
@@ -70,11 +70,3 @@ def find_wear(untouched: Image, first: Image, sensor: SensorModel) -> GelWear | 
     else:
         kind = "scratched" if length**2 > _SLENDER * area else "dirty"
     return GelWear(kind, ((x + 0.5) * cell, (y + 0.5) * cell), length * cell)
-
-
-def _without_dots(image: Image, sensor: SensorModel) -> Image:
-    grid = sensor.markers
-    if grid is None:
-        return image
-    dots = find_markers(image, grid, sensor.pixel_pitch)
-    return without_markers(image, dots.positions, dots.largest_radius(grid))

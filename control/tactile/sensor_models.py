@@ -40,6 +40,17 @@ class SensorModel:
     sensor_file: Path  # folder with the calibration of a typical sensor (`sensor_calibration`)
     markers: MarkerGrid | None = None  # dots printed on the gel, if any
     defocus: float = 0.0  # standard deviation of the camera's largest blur by its lens, px
+    measured: bool = True  # whether the sensor file was fitted to presses, not computed
+
+    @property
+    def images_only(self) -> str:
+        """Why no depths and forces are read from its images, and what to do; "" if they are."""
+        if self.measured:
+            return ""
+        return (
+            f"the sensor file of {self.name} is computed, not fitted to presses: images and contact are "
+            "read, no millimetres and newtons; calibrate this sensor (touchgoal record-presses)"
+        )
 
 
 _FILES = Path(__file__).parent / "sensor_files"
@@ -124,7 +135,7 @@ DIGIT = SensorModel(
 # 300 to 400 dimples on a ball would be 4.1 to 4.7 mm apart. Frame rate: that of these images.
 # Gel: as large as the image; case: a margin around it. Thickness and moduli were not found: the
 # Mini's. Sensor file: computed from lamp positions, because no images of rigid
-# balls may be shipped.
+# balls may be shipped; real presses have twice its contrast.
 GELSIGHT_WEDGE = replace(
     GELSIGHT_MINI,
     name="gelsight_wedge",
@@ -134,6 +145,7 @@ GELSIGHT_WEDGE = replace(
     case_size=(36.0e-3, 28.0e-3, 28.3e-3),
     frame_rate=30.0,
     sensor_file=_FILES / "gelsight_wedge",
+    measured=False,
 )
 
 SENSORS = {
@@ -173,4 +185,5 @@ def find_sensor(name: str) -> SensorModel:
         pixel_pitch=pitch,
         pitch_range=(pitch, pitch),
         sensor_file=folder,
+        measured=True,
     )

@@ -8,11 +8,12 @@ its checksum, so that everything under meta/ can be rebuilt from the data files 
 """
 
 import json
+import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
-from mmap import mmap
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,9 @@ from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.image_file import decode_image
 
-FRAMES_PER_ROW_GROUP = 32  # reading one window of touch reads a few groups, not the whole episode
+# Reading one window of touch reads a few groups, not the whole episode; the writer holds 35 kB of
+# metadata a group.
+_ROWS_PER_GROUP, _MAX_ROW_GROUPS = 32, 500
 _FOOTER_KEY, _CHECKSUM_KEY = b"touchgoal", b"touchgoal.crc32"
 # Measured on noisy 320 x 240 touch: 3.6 ms and 90 kB a frame; OpenCV's default filter 8.1 ms and
 # 110 kB, PIL at compress_level 1 11.0 ms and 114 kB.
@@ -64,6 +67,11 @@ class Description:
     stats: dict[str, statistics.Stats]  # key -> statistics, without the index columns
     video_crc32: dict[str, int]  # camera key -> checksum of its MP4 file
 
+    @property
+    def rows_per_group(self) -> int:
+        """Frames in a row group of the data file."""
+        return max(_ROWS_PER_GROUP, -(-self.length // _MAX_ROW_GROUPS))
+
 
 @dataclass(frozen=True, eq=False)
 class EncodedEpisode:
@@ -87,10 +95,9 @@ def encode(episode: Episode, fps: int, folder: Path | None = None) -> EncodedEpi
         values = episode.frames[key]
         if is_camera(key):
             videos[key] = encode_video(values, fps, folder)
-        elif is_image(key):
-            columns[key] = values if folder else [encode_png(image) for image in values]
         else:
-            columns[key] = values
+            encodes = is_image(key) and not folder
+            columns[key] = [encode_png(image) for image in values] if encodes else values
         compute = statistics.image_statistics if is_image(key) else statistics.array_statistics
         stats[key] = compute(values)
     description = Description(
@@ -145,9 +152,13 @@ def write_data_file(
     """Write the Parquet file of an episode's numbers and touch, with its description in the footer."""
 
     def tables() -> Iterator[pa.Table]:
-        for begin in range(0, encoded.description.length, FRAMES_PER_ROW_GROUP):
-            rows = slice(begin, begin + FRAMES_PER_ROW_GROUP)
-            arrays = {key: _to_arrow(key, c[rows], begin) for key, c in encoded.columns.items()}
+        size = encoded.description.rows_per_group
+        for begin in range(0, encoded.description.length, size):
+            rows = slice(begin, begin + size)
+            arrays = {
+                key: _to_arrow(key, c[rows], begin, path.parent)
+                for key, c in encoded.columns.items()
+            }
             yield pa.table(arrays | {key: pa.array(c[rows]) for key, c in indices.items()})
 
     with atomic_write(path) as unfinished:
@@ -155,9 +166,9 @@ def write_data_file(
 
 
 def write_tables(path: Path, tables: Iterable[pa.Table], description: Description) -> None:
-    """Write tables of frames as one Parquet file, with a checksum on every page and the description.
+    """Write tables of an episode's frames as one Parquet file, with a checksum on every page.
 
-    Each but the last has a multiple of `FRAMES_PER_ROW_GROUP` frames.
+    Each but the last has a whole number of row groups; the description goes into the footer.
     """
     text = json.dumps(vars(description)).encode()
     footer = {_FOOTER_KEY: text, _CHECKSUM_KEY: str(zlib.crc32(text)).encode()}
@@ -170,9 +181,10 @@ def write_tables(path: Path, tables: Iterable[pa.Table], description: Descriptio
         use_dictionary=False,
         write_statistics=False,  # they would repeat whole images as a column's min and max
         write_page_checksum=True,
+        write_batch_size=8,  # rows between two looks at the size of a page, which lies in memory
     ) as file:
         for table in chain([first], marked):
-            file.write_table(table, FRAMES_PER_ROW_GROUP)
+            file.write_table(table, description.rows_per_group)
 
 
 def has_description(file: pq.ParquetFile) -> bool:
@@ -202,17 +214,23 @@ def read_description(file: pq.ParquetFile) -> Description:
     return description
 
 
-def _to_arrow(key: str, column: Shaped[np.ndarray, "n ..."] | list[bytes], first: int) -> pa.Array:
-    if is_image(key):
-        names = [f"frame-{first + i:06d}.png" for i in range(len(column))]
-        pngs = [x if isinstance(x, bytes) else encode_png(x) for x in column]
-        parts = [pa.array(pngs, pa.binary()), pa.array(names)]
-        return pa.StructArray.from_arrays(parts, names=["bytes", "path"])
-    values = np.ascontiguousarray(column)
-    flat = pa.array(values.reshape(-1))
-    if FEATURES[key].shape == (1,):
-        return flat
-    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+def _to_arrow(
+    key: str, column: Shaped[np.ndarray, "n ..."] | list[bytes], first: int, folder: Path
+) -> pa.Array:
+    """Return a column; PNGs lie in a nameless file in `folder`, not in memory."""
+    if not is_image(key):
+        values = np.ascontiguousarray(column)
+        flat = pa.array(values.reshape(-1))
+        one = FEATURES[key].shape == (1,)
+        return flat if one else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+    with tempfile.TemporaryFile(dir=folder) as file:
+        sizes = [file.write(x if isinstance(x, bytes) else encode_png(x)) for x in column]
+        file.flush()
+        data = pa.py_buffer(mmap(file.fileno(), 0, access=ACCESS_READ))
+    ends = pa.py_buffer(np.cumsum([0, *sizes], dtype=np.int32))
+    pngs = pa.BinaryArray.from_buffers(pa.binary(), len(sizes), [None, ends, data])
+    names = pa.array(f"frame-{first + i:06d}.png" for i in range(len(sizes)))
+    return pa.StructArray.from_arrays([pngs, names], names=["bytes", "path"])
 
 
 def read_columns(

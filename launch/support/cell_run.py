@@ -1,7 +1,5 @@
 """Steps that every command with a moving arm shares: connect and check."""
 
-from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,23 +12,15 @@ if TYPE_CHECKING:
 
 
 def connect(cell: "CellConfig", new_episode: bool = True) -> "CellConnection":
-    """Connect to the cell, a twin as the only one; for a new episode it first puts its scene back."""
+    """Connect to a cell or simulate it; see `connect_cell`."""
     from touchgoal.control import features as ft
     from touchgoal.control.cell.connection import connect_cell
-    from touchgoal.control.cell.twin_client import lease_twin, reset_scene
 
     if cell.arm == "sim":
         from touchgoal.sim_envs.cell.in_process import simulate_cell
 
         return simulate_cell(cell, ft.CONTROL_HZ)
-    with ExitStack() as undo:
-        lease = undo.enter_context(lease_twin(cell.task.twin)) if cell.task.twin else None
-        if lease and new_episode:
-            reset_scene(cell.task.twin, cell.task.seed)
-            print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
-        connection = connect_cell(cell, ft.CONTROL_HZ, new_episode)
-        undo.pop_all()
-    return replace(connection, lease=lease)
+    return connect_cell(cell, ft.CONTROL_HZ, new_episode)
 
 
 def check_cell(cell: "CellConfig", connection: "CellConnection", episodes: Path) -> "ActionFilter":

@@ -15,8 +15,6 @@ def confirm(cell: "CellConfig", connection: "CellConnection | None" = None) -> N
 
     Of a connection each fingertip must first feel that the operator touches it.
     """
-    from touchgoal.control.features import TACTILE
-    from touchgoal.control.interfaces import TactileSensor
     from touchgoal.control.sensors.exchanged import probe_fingertips
 
     if cell.moves_nothing_real:
@@ -24,13 +22,8 @@ def confirm(cell: "CellConfig", connection: "CellConnection | None" = None) -> N
     name = f"{cell.arm} {cell.address}".strip()
     if sys.stdin is None or not sys.stdin.isatty():
         raise UserError("nobody is there to confirm: run it in a terminal, or add --yes")
-    cameras = connection.cameras if connection else {}
-    tips = {
-        key.rpartition("_")[2]: tip
-        for key in TACTILE
-        if isinstance(tip := cameras.get(key), TactileSensor)
-    }
-    probe_fingertips(tips)
+    tips = connection.fingertips if connection else {}
+    probe_fingertips({key.rpartition("_")[2]: tip for key, tip in tips.items()})
     print(f"The arm will move. One hand on its stop, nobody in reach? Type: {name}")
     if input("> ").strip() != name:
         raise UserError("not confirmed; nothing has moved")

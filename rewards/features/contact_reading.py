@@ -1,19 +1,19 @@
 """Contact of each fingertip frame by frame: whether it touches, how hard, where, and slip."""
 
+from collections.abc import Mapping
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from touchgoal.control.arrays import Image
+from touchgoal.control.arrays import Image, Images
 from touchgoal.control.features import TACTILE, TRUTH_CONTACT
-from touchgoal.control.tactile.background import Background
-from touchgoal.control.tactile.contact import ContactDetector, threshold_for
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.force import contact_centre, estimate_force
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.touches import ContactStream, touch_background
+from touchgoal.episodes.touches import ContactStream, contact_detector
 from touchgoal.rewards.curves import Contact
 
 _CELL = 8  # px, finest cells of the depth map: a third of the time of 2 (`DepthEstimator`)
@@ -37,18 +37,16 @@ class ContactReader:
         self._pitch, self._size = 0.0, untouched.shape[2:0:-1]
         if sensor is not None:
             calibration = load(sensor.sensor_file)
-            self._depth = DepthEstimator(calibration, _CELL)
+            if not sensor.images_only:
+                self._depth = DepthEstimator(calibration, _CELL)
             self._pitch = calibration.pixel_pitch
             self._size = calibration.background.shape[1::-1]
-        untouched = np.stack([self._resized(frame) for frame in untouched])
-        background = touch_background(untouched)
-        threshold = threshold_for(untouched, background)
-        self._detector = ContactDetector(Background(background[None]), threshold)
+        self._detector = contact_detector(np.stack([self._resized(f) for f in untouched]))
 
     def read(self, frames: UInt8[np.ndarray, "n h w 3"]) -> dict[str, np.ndarray]:
         """Return by part (`features.embedded`) the readings of the next frames, (n,) or (n, 2).
 
-        Of a sensor without a calibration file, whether it touches alone.
+        Of a sensor without a calibration file, or a computed one, whether it touches alone.
         """
         held, force, centre, slip = [], [], [], []
         for frame in frames:
@@ -58,7 +56,7 @@ class ContactReader:
             centre.append(c)
             slip.append(self._slip.update(touching, c))
         readings = {"held": np.array(held)}
-        if self._sensor is None:
+        if self._depth is None:
             return readings
         numbers = {"force": force, "centre": centre, "slip": slip}
         return readings | {name: np.array(n, np.float32) for name, n in numbers.items()}
@@ -111,13 +109,13 @@ class SlipMeter:
 class ContactSearch:
     """Search for the first contact over consecutive chunks of an episode.
 
-    It takes the simulator's truth, else detects contact in the tactile images by comparing with the
-    first frames, which must be free of contact.
+    It takes the simulator's truth, else detects contact in the tactile images by comparing with those
+    given as untouched, else with the first frames, which must be free of contact.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, untouched: Mapping[str, Images]) -> None:
         self.contact = Contact(None, "no touch")
-        self._streams: dict[str, ContactStream] = {}
+        self._streams = {key: ContactStream(frames) for key, frames in untouched.items()}
         self._frames = 0
 
     def update(self, chunk: Episode) -> Contact:

@@ -1,6 +1,7 @@
 """Embedding of trajectories and goals with frozen encoders, in one go or piece by piece."""
 
 import hashlib
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
@@ -10,9 +11,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
 
+from touchgoal.control.arrays import Images
 from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT, WRENCH
 from touchgoal.control.tactile.background import first_steady, untouched_frames
-from touchgoal.control.tactile.image_guard import check_unpressed
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.pretrained import AnyTouchEncoder
@@ -100,6 +101,8 @@ class EpisodeEmbedder:
                 self._aligned.check_towers(towers)
             encoder.eval()
             hashed, sensor = _weights_hash(encoder), encoder.config.sensor or ""
+            if parts and (model := SENSORS.get(sensor)) and model.images_only:
+                print(model.images_only, file=sys.stderr)
             self.made_with = replace(self._images_with, encoder=hashed, sensor=sensor)
 
     @cached_property
@@ -116,10 +119,17 @@ class EpisodeEmbedder:
         """
         return self.embed_chunks([episode], fps, source)
 
-    def embed_chunks(self, chunks: Iterable[Episode], fps: float, source: str) -> EmbeddedEpisode:
+    def embed_chunks(
+        self,
+        chunks: Iterable[Episode],
+        fps: float,
+        source: str,
+        untouched: Mapping[str, Images] | None = None,
+    ) -> EmbeddedEpisode:
         """Embed consecutive chunks of one episode, as `embed_episode` embeds it in one go.
 
-        The first chunk has at least 5 frames, unless it is the whole episode.
+        The first chunk has at least 5 frames, unless it is the whole episode. `untouched` holds frames
+        of the fingertips that give their backgrounds in place of its first ones.
         """
         following = iter(chunks)
         first = next(following)
@@ -129,7 +139,9 @@ class EpisodeEmbedder:
                 f"{source} starts in contact, so its fingertips have no background; record it "
                 f"with {START_FRAMES} frames before the first touch"
             )
-        stream, search, pieces = self.stream(first.frames, fps, source), ContactSearch(), []
+        apart = untouched or {}
+        stream = self.stream({**first.frames, **apart}, fps, source)
+        search, pieces = ContactSearch(apart), []
         for chunk in chain([first], following):
             search.update(chunk)
             pieces.append(stream.embed(chunk.frames))
@@ -165,7 +177,6 @@ class EpisodeEmbedder:
             first_steady(first[side], f"{side} of {source}")
             if sensor is not None:
                 check_touch(first[side], sensor, f"{side} of {source}")
-                check_unpressed(touch_background(first[side]), sensor, f"{side} of {source}")
         about = EmbeddedEpisode(
             {}, self.made_with if sides else self._images_with, source, fps, sides
         )

@@ -33,7 +33,8 @@ def embed_trajectory(
     if path is not None and path.is_file():
         return _load(path, trajectory)
     chunks = trajectory.chunks() if chunks is None else chunks
-    embedded = embedder.embed_chunks(chunks, trajectory.fps, trajectory.source)
+    about = trajectory.fps, trajectory.source, trajectory.untouched
+    embedded = embedder.embed_chunks(chunks, *about)
     if path is not None:
         about = {
             "contact": asdict(embedded.contact),

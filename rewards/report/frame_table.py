@@ -98,10 +98,8 @@ def _describe(signal: str, facts: Facts) -> dict[str, Any]:
         meaning, direction, unit = "reward of the step to the next frame", "higher", facts.unit
     else:
         kind = next(prefix for prefix in _MEANING if signal.startswith(prefix))
-        (meaning, direction), unit = (
-            _MEANING[kind],
-            "cosine distance" if kind == RAW else facts.unit,
-        )
+        meaning, direction = _MEANING[kind]
+        unit = "cosine distance" if kind == RAW else facts.unit
         meaning = f"{signal.removeprefix(kind)}: {meaning}"
     return {
         "description": meaning,

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from touchgoal.episodes.film import curve_colors
 from touchgoal.rewards.curves import main_curve, reference_levels
+from touchgoal.rewards.report.plot import line_styles
 from touchgoal.rewards.report.record import Facts, Record
 from touchgoal.rewards.report.tables import COLUMNS
 from touchgoal.rewards.report.thumbnails import COLUMNS as SHEET_COLUMNS
@@ -29,7 +29,6 @@ PER_PAGE = 100  # trajectories
 _MOST_POINTS = 600  # of a curve in a page; a longer one is drawn by evenly spaced frames
 _FILES = Path(__file__).parent / "page_files"
 _WORDS = {"source": "trajectory", "object": "object", "outcome": "outcome"}
-
 _WHOLE = ("t_drop_50", "contact_lag", "peaks")  # metrics that count
 
 
@@ -105,11 +104,12 @@ def _content(facts: Sequence[Facts], episodes: Sequence[Mapping[str, Any]]) -> d
             "digits": 0 if field in _WHOLE else 2,
         }
         for header, (field, meaning) in COLUMNS.items()
+        if any(m[field] is not None for f in facts for m in f.measured.values())
     ]
     return {
         "curves": names,
         "main": main_curve(names),
-        "colors": curve_colors(names),
+        "styles": line_styles(names),
         "unit": facts[0].unit,
         "levels": reference_levels(names, facts[0].normalised),
         "columns": [*used, {"key": "frames", "label": "frames", "digits": 0}, *metrics],

@@ -1,15 +1,26 @@
 """Plots of cost and reward curves, one panel under another."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from touchgoal.episodes.film import curve_colors
 from touchgoal.rewards.curves import FUSED, GAMMA, Curves, main_curve, reference_levels
 
+_COLORS = {  # Okabe and Ito, "Color universal design" (2008), distinct for colour-blind readers, and a brown
+    "#0072B2": ("image", "front", "slip"),
+    "#D55E00": ("tactile", "object", "wrench"),
+    "#CC79A7": ("text", "words", "force"),
+    "#009E73": ("image+tactile", "wrist", "value"),
+    "#56B4E9": ("image+text", "wrist_map"),
+    "#E69F00": ("centre",),
+    "#7A5C2E": ("held",),
+}
+CURVES = {name: color for color, names in _COLORS.items() for name in names} | {FUSED: "#000000"}
+"""Colour of each curve that has a name, in plots, pages and films."""
 _DASHES = ((0, (5, 2)), (0, (1.5, 1.5)), (0, (5, 1.5, 1.5, 1.5)), "-", (0, (3, 1)), (0, (8, 2)))
 _SIZE = (12.0, 10.0)  # inches, at 100 pixels an inch
 _PANELS = ((0.53, 0.345), (0.275, 0.17), (0.06, 0.15))  # bottom and height of each panel
@@ -25,43 +36,46 @@ def plot(curves: Curves, gamma: float = GAMMA, about: str = "") -> Figure:
     costs = curves.costs
     main = main_curve(costs)
     rewarded = [main] if main == FUSED else list(costs)
+    potential = curves.potential_rewards(gamma)
+    unit = "distance to goal (cost, normalised)" if curves.normalised else f"cost: {curves.unit}"
     panels = (
-        (
-            "distance to goal (cost, normalised)" if curves.normalised else f"cost: {curves.unit}",
-            costs,
-        ),
+        (unit, costs),
         ("state reward\n= -cost", {name: curves.rewards[name] for name in rewarded}),
-        (
-            f"potential-based reward\nγ = {gamma:g} per second",
-            {name: curves.potential_rewards(gamma)[name] for name in rewarded},
-        ),
+        (f"potential-based reward\nγ = {gamma:g} per second", {n: potential[n] for n in rewarded}),
     )
     fps, contact = curves.fps, curves.contact
-    styles = line_styles(list(costs))
+    styles, several = line_styles(list(costs)), len(costs) > 1
+    width = 0.725 if several else 0.88  # names stand beside several curves, a lone one's above
     figure = Figure(figsize=_SIZE, dpi=100)
     length = len(curves)
     for k, ((label, lines), (bottom, height)) in enumerate(zip(panels, _PANELS, strict=True)):
-        axes = figure.add_axes((0.095, bottom, 0.725, height))
+        axes = figure.add_axes((0.095, bottom, width, height))
         for name, line in lines.items():
             axes.plot(np.arange(length) / fps, line, **styles[name])
         _frame_axes(axes, label, (length - 1) / fps)
         if k == 0:
             _frame_costs(axes, reference_levels(lines, bool(curves.normalised)))
         if contact.frame is not None:
-            name = f"contact ({contact.label_source})" if k == 0 else ""
+            name = f"contact ({contact.label_source})" * (k == 0)
             _mark_contact(axes, contact.frame / fps, name)
-        if k < 2:  # in the last panel all curves end near 0: colours and dashes distinguish them
+        axes.tick_params(labelbottom=k != 1)
+        # In the last panel all curves end near 0: colours and dashes distinguish them.
+        if several and k < 2:
             _label_lines(axes, lines, styles, _LABEL_GAP * _PANELS[0][1] / height)
-            axes.tick_params(labelbottom=k == 0)
     figure.axes[-1].set_xlabel("time (s)", fontsize=12)
     goals = " and ".join(dict.fromkeys(curves.goal.values()))
-    heading, goal = (
-        _elide_middle(" · ".join(filter(None, (curves.source, about))), 85),
-        _elide_middle(f"goal: {goals}", 125),
-    )
+    heading = _elide_middle(" · ".join(filter(None, (curves.source, about))), 85)
+    goal = _elide_middle(f"goal: {goals}" if several else f"{main} · goal: {goals}", 125)
     figure.text(0.095, 0.95, heading, fontsize=15, fontweight="bold", parse_math=False)
     figure.text(0.095, 0.915, goal, fontsize=12, color="0.35", parse_math=False)
     return figure
+
+
+def curve_colors(names: Sequence[str]) -> dict[str, str]:
+    """Return the colours of `CURVES`; other names, such as a camera's, get what is left."""
+    taken = {CURVES.get(name) for name in names}
+    left = cycle([color for color in _COLORS if color not in taken] or _COLORS)
+    return {name: CURVES.get(name) or next(left) for name in names}
 
 
 def line_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -69,17 +83,12 @@ def line_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
     Colours are for the colour-blind, too; the dashes distinguish them in grey.
     """
-    main, colors = main_curve(names), curve_colors(names)
-    single = [name for name in names if name != main]
-    styles: dict[str, dict[str, Any]] = {
-        name: {
-            "color": colors[name],
-            "linestyle": _DASHES[k % len(_DASHES)],
-            "linewidth": 1.8,
-        }
-        for k, name in enumerate(single)
+    main, dashes = main_curve(names), cycle(_DASHES)
+    look = {n: ("-", 2.6) if n == main else (next(dashes), 1.8) for n in names}
+    fields = ("color", "linestyle", "linewidth")
+    return {
+        n: dict(zip(fields, (c, *look[n]), strict=True)) for n, c in curve_colors(names).items()
     }
-    return styles | {main: {"color": colors[main], "linestyle": "-", "linewidth": 2.6}}
 
 
 def _frame_axes(axes: Axes, label: str, end: float) -> None:
@@ -111,20 +120,9 @@ def _frame_costs(axes: Axes, levels: Sequence[tuple[float, str]]) -> None:
 
 def _mark_contact(axes: Axes, time: float, name: str) -> None:
     axes.axvline(time, color="0.35", linewidth=1.2, linestyle=(0, (2, 3)), zorder=1)
-    if not name:
-        return
-    right = time > 0.85 * axes.get_xlim()[1]
-    axes.annotate(
-        name,
-        (time, 1),
-        xycoords=("data", "axes fraction"),
-        xytext=(-6 if right else 6, -2),
-        textcoords="offset points",
-        ha="right" if right else "left",
-        va="top",
-        fontsize=11,
-        color="0.35",
-    )
+    side, gap = ("right", -6) if time > 0.85 * axes.get_xlim()[1] else ("left", 6)
+    at = {"xycoords": ("data", "axes fraction"), "xytext": (gap, -2), "textcoords": "offset points"}
+    axes.annotate(name, (time, 1), **at, ha=side, va="top", fontsize=11, color="0.35")
 
 
 def _label_lines(
@@ -136,28 +134,18 @@ def _label_lines(
     """Name each line at its right end, outside the axes, moved apart where ends meet."""
     low, high = axes.get_ylim()
     names = sorted(values, key=lambda name: values[name][-1])
+    look: dict[str, Any] = {
+        "xycoords": "axes fraction",
+        "textcoords": "axes fraction",
+        "va": "center",
+    }
+    look |= {"annotation_clip": False, "fontsize": 12.5}
+    arrow = {"arrowstyle": "-", "linewidth": 0.8, "shrinkA": 1, "relpos": (0, 0.5)}
     ends = np.array([(values[name][-1] - low) / (high - low) for name in names])
     for name, end, height in zip(names, ends, _spread_labels(ends, gap), strict=True):
-        color, width = styles[name]["color"], styles[name]["linewidth"]
-        axes.annotate(
-            name,
-            (1, end),
-            xycoords="axes fraction",
-            xytext=(1.045, height),
-            textcoords="axes fraction",
-            va="center",
-            fontsize=12.5,
-            fontweight="bold" if width > 2 else "normal",
-            color=color,
-            annotation_clip=False,
-            arrowprops={
-                "arrowstyle": "-",
-                "color": color,
-                "linewidth": 0.8,
-                "shrinkA": 1,
-                "relpos": (0, 0.5),
-            },
-        )
+        color, weight = styles[name]["color"], "bold" if styles[name]["linewidth"] > 2 else "normal"
+        text, line = {"color": color, "fontweight": weight, **look}, {"color": color, **arrow}
+        axes.annotate(name, (1, end), xytext=(1.045, height), arrowprops=line, **text)
 
 
 def _spread_labels(heights: np.ndarray, gap: float) -> np.ndarray:

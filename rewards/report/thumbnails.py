@@ -1,8 +1,9 @@
-"""Small images of a trajectory, at most 32 frames of 96 px, collected while it is read."""
+"""Small images of a trajectory, at most 32 frames, collected while it is read."""
 
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from touchgoal.control.features import IMAGE_PREFIX
 from touchgoal.episodes.schema import Episode, is_image
 
 MOST_FRAMES = 32
-WIDTH = 96  # px
+_HEIGHT, _LONE_HEIGHT = 96, 168  # px at most, of several cameras and fingertips, and of a lone one
 COLUMNS = 8  # images in a row of a sheet
 _QUALITY = 70  # of JPEG
 
@@ -37,18 +38,17 @@ class Thumbnails:
         start = 0
         for chunk in chunks:
             rows = [t - start for t in self.planned if start <= t < start + len(chunk)]
-            self._add({key: chunk.frames[key][rows] for key in filter(is_image, chunk.frames)})
+            self.add(replace(chunk, frames={k: v[rows] for k, v in chunk.frames.items()}))
             start += len(chunk)
             yield chunk
 
     def add(self, planned: Episode) -> None:
-        """Add the planned frames, where the trajectory is not read as a whole."""
-        self._add({key: planned.frames[key] for key in filter(is_image, planned.frames)})
-
-    def _add(self, frames: Mapping[str, UInt8[np.ndarray, "n h w 3"]]) -> None:
-        for key, images in frames.items():
-            name = key.removeprefix(IMAGE_PREFIX)
-            self._images.setdefault(name, []).extend(_shrunk(image) for image in images)
+        """Add planned frames; only where the trajectory is not read as a whole, all of them at once."""
+        keys = list(filter(is_image, planned.frames))
+        height = _LONE_HEIGHT if len(keys) == 1 else _HEIGHT
+        for key in keys:
+            small = [_shrunk(image, height) for image in planned.frames[key]]
+            self._images.setdefault(key.removeprefix(IMAGE_PREFIX), []).extend(small)
 
     def sheets(self) -> dict[str, UInt8[np.ndarray, " bytes"]]:
         """Return a JPEG of each camera and fingertip: its frames in rows of 8, from the top left."""
@@ -58,16 +58,19 @@ class Thumbnails:
 def last_of(sheet: UInt8[np.ndarray, " bytes"], count: int) -> bytes:
     """Return the last of the `count` images of a sheet as a JPEG of its own."""
     with Image.open(io.BytesIO(sheet.tobytes())) as image:
-        height = image.height // math.ceil(count / COLUMNS)
+        width, height = (
+            image.width // min(count, COLUMNS),
+            image.height // math.ceil(count / COLUMNS),
+        )
         row, column = divmod(count - 1, COLUMNS)
-        corner = column * WIDTH, row * height
-        box = (*corner, corner[0] + WIDTH, corner[1] + height)
+        box = column * width, row * height, (column + 1) * width, (row + 1) * height
         return _jpeg(np.asarray(image.crop(box)))
 
 
-def _shrunk(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "y x 3"]:
-    height = max(round(WIDTH * image.shape[0] / image.shape[1]), 1)
-    return np.asarray(cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA))
+def _shrunk(image: UInt8[np.ndarray, "h w 3"], most: int) -> UInt8[np.ndarray, "y x 3"]:
+    height = min(most, len(image))
+    width = max(round(height * image.shape[1] / len(image)), 1)
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _sheet(images: list[np.ndarray]) -> UInt8[np.ndarray, " bytes"]:

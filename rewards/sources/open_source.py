@@ -21,6 +21,7 @@ def open_source(
     with_touch: bool = True,
     fps: float | None = None,
     keys: Mapping[str, str] | None = None,
+    background: Sequence[Path] = (),
 ) -> Source:
     """Open a source; what it holds is read later.
 
@@ -35,6 +36,7 @@ def open_source(
         index: which episodes of the set; none for all.
         fps: frames per second of folders of images; None for 20.
         keys: new keys of features of an episode set, see `EpisodeSet`.
+        background: the fingertips of videos untouched, see `open_videos`.
     """
     path = local_folder(path)
     if not path.exists():
@@ -47,7 +49,11 @@ def open_source(
         if key not in CAMERAS:
             names = " or ".join(name.removeprefix(IMAGE_PREFIX) for name in CAMERAS)
             raise UserError(f"there is no camera '{camera}': choose {names}")
-        return open_videos(path, key, with_touch, fps)
+        return open_videos(path, key, with_touch, fps, background)
+    if background:
+        raise UserError(
+            f"{path} is a set of episodes, which begin untouched: leave --background out"
+        )
     if fps is not None:
         raise UserError(f"{path} states its own frame rate: leave --fps out")
     source = open_episodes(root, key, index, with_touch, keys)
@@ -62,13 +68,14 @@ def open_successes(
     with_touch: bool,
     assume_success: bool,
     keys: Mapping[str, str] | None = None,
+    background: Sequence[Path] = (),
 ) -> list[Source]:
     """Open the successful episodes of one set, or several plain videos of successes.
 
     With `assume_success` episodes without a recorded outcome count. UserError: as `open_source`; no
     source, several sets, or sets and videos; fewer than two successes.
     """
-    sources = [open_source(path, camera, with_touch=with_touch, keys=keys) for path in paths]
+    sources = [open_source(p, camera, (), with_touch, None, keys, background) for p in paths]
     sets = [s for s in sources if isinstance(s.trajectories[0], EpisodeTrajectory)]
     if not sources or len(sets) > 1 or (sets and len(sources) > 1):
         raise UserError("give one set of episodes, or several videos")

@@ -4,8 +4,9 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from touchgoal.control.arrays import Images
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.rewards.goals import Inputs
 
@@ -25,6 +26,8 @@ class Trajectory(ABC):
     length: int  # number of frames
     fps: float  # frames per second
     meta: Mapping[str, MetaValue]  # facts such as object and outcome, as far as they are recorded
+    # untouched frames of the fingertips, by key, where they were recorded apart
+    untouched: Mapping[str, Images] = field(default_factory=dict, kw_only=True)
 
     @abstractmethod
     def checksum(self) -> str:

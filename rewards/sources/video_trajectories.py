@@ -8,11 +8,13 @@ if known object and task) says how each one ended.
 """
 
 import csv
+import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
+from touchgoal.control.arrays import Images
 from touchgoal.control.features import (
     CAMERAS,
     CONTROL_HZ,
@@ -24,6 +26,7 @@ from touchgoal.control.features import (
     WRIST,
 )
 from touchgoal.control.sensors.clip import IMAGES, VIDEOS, Clip, in_natural_order, open_clip
+from touchgoal.control.tactile.background import SETTLES_WITHIN
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.sources.trajectory import Skipped, Source, Trajectory, frames_per_chunk
@@ -49,10 +52,13 @@ class VideoTrajectory(Trajectory):
     clips: Mapping[str, Clip]  # by what they show
 
     def checksum(self) -> str:
-        """Return sizes and times of the files."""
+        """Return sizes and times of the files, and a hash of the untouched frames given apart."""
         paths = [p for clip in self.clips.values() for p in _files(clip.path)]
         stats = [path.stat() for path in paths]
-        return " ".join(f"{s.st_size}:{s.st_mtime_ns}" for s in stats)
+        hashes = [
+            hashlib.sha256(frames.tobytes()).hexdigest() for frames in self.untouched.values()
+        ]
+        return " ".join([*(f"{s.st_size}:{s.st_mtime_ns}" for s in stats), *hashes])
 
     def chunks(self) -> Iterator[Episode]:
         """See Trajectory."""
@@ -65,7 +71,13 @@ class VideoTrajectory(Trajectory):
             yield Episode(frames, self.name, dict(self.meta))
 
 
-def open_videos(path: Path, camera: str, with_touch: bool, fps: float | None) -> Source:
+def open_videos(
+    path: Path,
+    camera: str,
+    with_touch: bool,
+    fps: float | None,
+    background: Sequence[Path] = (),
+) -> Source:
     """Open a video file, a folder of images, or a folder that holds several of them.
 
     UserError: no video or image, a frame rate given that the videos state themselves, or no
@@ -74,8 +86,11 @@ def open_videos(path: Path, camera: str, with_touch: bool, fps: float | None) ->
     Args:
         camera: key of the camera that a file without a role shows.
         fps: frames per second of folders of images; None for 20.
+        background: image, video or folder of images of each fingertip untouched, left before right;
+            none: the first frames of each video.
     """
     found = _find(path, camera)
+    apart = [next(open_clip(file).chunks(SETTLES_WITHIN)) for file in background]
     labels = _read_labels(path if path.is_dir() else path.parent)
     offset, opened = 0, list[VideoTrajectory]()
     skipped: list[Skipped] = []
@@ -83,12 +98,17 @@ def open_videos(path: Path, camera: str, with_touch: bool, fps: float | None) ->
         kept = {k: f for k, f in files.items() if with_touch or k not in TACTILE}
         try:
             clips = _open_clips(name, kept, fps)
+            untouched = _backgrounds(name, clips, apart)
         except UserError as error:
             skipped.append(Skipped(name, str(error)))
             continue
         first = next(iter(clips.values()))
         rate, meta = fps or first.fps or CONTROL_HZ, labels.get(name, {})
-        opened.append(VideoTrajectory(name, name, i, offset, first.length, rate, meta, clips))
+        opened.append(
+            VideoTrajectory(
+                name, name, i, offset, first.length, rate, meta, clips, untouched=untouched
+            )
+        )
         offset += first.length
     if not opened:
         raise UserError(skipped[0].reason)
@@ -188,6 +208,17 @@ def _open_clips(name: str, files: Mapping[str, Path], fps: float | None) -> dict
     if fps is not None and first.fps is not None:
         raise UserError(f"{first.path} states its own frame rate: leave --fps out")
     return clips
+
+
+def _backgrounds(
+    name: str, clips: Mapping[str, Clip], given: Sequence[Images]
+) -> dict[str, Images]:
+    """Return the untouched frames given for each fingertip; UserError if they do not fit its video."""
+    sides = [key for key in TACTILE if key in clips] if given else []
+    sizes = [clips[side].shape for side in sides]
+    if (there := [frames.shape[1:3] for frames in given]) != sizes:
+        raise UserError(f"{name}: --background has rows and columns {there}, its videos {sizes}")
+    return dict(zip(sides, given, strict=True))
 
 
 def _read_labels(folder: Path) -> dict[str, dict[str, MetaValue]]:

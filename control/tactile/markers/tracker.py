@@ -1,6 +1,6 @@
 """Dots printed on a gel: detection, tracking, and removal from an image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import cv2
@@ -9,13 +9,25 @@ from jaxtyping import Float32, Int
 
 from touchgoal.control.arrays import AnyImage, Image
 from touchgoal.control.tactile.markers.matching import Dots, Flags, Spots, average_neighbours, match
-from touchgoal.control.tactile.sensor_models import MarkerGrid
+from touchgoal.control.tactile.sensor_models import MarkerGrid, SensorModel
 from touchgoal.runtime.errors import UserError
 
 _FAINTEST = 0.5  # share of the usual darkness; a fainter spot is no dot
 _LEAST_FOUND = 0.7  # share of the grid's dots that a marker gel must show
+_SCALES = (
+    1.0,
+    1.25,
+    0.8,
+    1.55,
+    0.65,
+    1.95,
+)  # of another gel's or crop's grid, against the sensor's
+_FEWEST, _SPAN = 12, 0.5  # dots of another grid; share of the image's width and height it covers
+_TURN = np.radians(35)  # of a grid, at most
+_CROOKED = 0.15  # of its spacing: usual distance from a straight lattice, above which it is none
 _NOISE = 0.02  # darkness of a spot that may be noise
 _RIM = 2.0  # px around a dot's nominal radius that may still be dark
+_UNKNOWN = -(10**6)  # cell of a spot that is no dot
 _LARGER = 1.1  # factor on the nominal radius: largest dots of another gel
 
 Grey = Float32[np.ndarray, "h w 1"]
@@ -30,6 +42,7 @@ class Markers:
 
     positions: Dots
     found: Flags
+    diameter: float  # of a dot, nominal, px
 
     def largest_radius(self, grid: MarkerGrid) -> float:
         """Return the radius (px) that covers such dots on an untouched gel, from their spacing."""
@@ -43,15 +56,15 @@ class MarkerTracker:
     The dots are expected to stay, to keep moving, or else to be back at rest or to have jumped by
     up to half a spacing, turned and sheared, whichever explains the frame best (`markers.matching`).
     A dot that no spot fits is lost, which is flagged; it is expected where its neighbours'
-    displacement carries it. The grid's sizes may be off by a fifth; `pixel_pitch` is m per px.
-    UserError if the untouched frame does not show it.
+    displacement carries it. The grid is the one that `find_markers` finds; `pixel_pitch` is m per px.
+    UserError if the untouched frame shows none.
     """
 
     def __init__(self, untouched: Image, grid: MarkerGrid, pixel_pitch: float) -> None:
-        self._size = grid.diameter / pixel_pitch
         self.rest = self.now = find_markers(untouched, grid, pixel_pitch)
+        self._size = self.rest.diameter
         _, darkness = _spots(_grey(untouched), self._size)
-        self._faintest = _FAINTEST * _usual(darkness, grid)
+        self._faintest = _FAINTEST * _usual(darkness, self.rest.found.size)
         steps = np.diff(self.rest.positions, axis=1)
         self._spacing = float(np.median(np.linalg.norm(steps, axis=-1)))
         self._motion = np.zeros_like(self.rest.positions)
@@ -78,39 +91,90 @@ class MarkerTracker:
             moved = average_neighbours(positions - self.rest.positions, found)
             positions[~found] = (self.rest.positions + moved)[~found]
         self._motion = positions - before
-        self.now = Markers(positions, found)
+        self.now = Markers(positions, found, self._size)
         return self.now
 
 
 def find_markers(image: Image, grid: MarkerGrid, pixel_pitch: float) -> Markers:
     """Find the dots of an untouched gel, by rows (downwards) and columns (rightwards).
 
-    The grid may be rotated by up to 30 degrees, shifted, and scaled by a fifth; `pixel_pitch` is m
-    per px. UserError if less than 70 % of the dots are visible.
+    The grid may be rotated by up to 30 degrees and shifted. Rows, columns and pitch are the sensor's
+    (to a fifth; `pixel_pitch` is m per px) if 70 % of those dots are visible, some of each row and
+    column; else the image's: the largest straight grid of 0.65 to 1.95 times that pitch. UserError
+    if there is none.
     """
-    grey, size = _grey(image), grid.diameter / pixel_pitch
+    grey = _grey(image)
+    expected = _find(grey, grid, pixel_pitch, grid.rows * grid.columns)
+    seen = expected.found
+    if seen.mean() >= _LEAST_FOUND and seen.any(0).all() and seen.any(1).all():
+        return expected
+    others = [_find(grey, grid, pixel_pitch / scale) for scale in _SCALES]
+    others = [other for other in others if _is_grid(other, grey)]
+    if not others:
+        raise UserError(
+            f"only {seen.sum()} of {seen.size} markers are visible, and no grid of other rows, "
+            "columns or pitch: check that the sensor has a marker gel and that nothing touches it"
+        )
+    return max(others, key=lambda other: int(other.found.sum()))
+
+
+def _find(grey: Grey, grid: MarkerGrid, pixel_pitch: float, count: int | None = None) -> Markers:
+    """Find a grid of the sensor's pitch, and of its rows and columns if it has the `count` of dots."""
+    size = grid.diameter / pixel_pitch
     spots, darkness = _spots(grey, size)
-    spots = _refined(grey, spots[darkness > _FAINTEST * _usual(darkness, grid)], size / 2)
+    usual = _usual(darkness, count or int(grey.size * (pixel_pitch / grid.pitch) ** 2))
+    spots = _refined(grey, spots[darkness > _FAINTEST * usual], size / 2)
     cells = _ordered(spots, grid.pitch / pixel_pitch)
+    known = cells[cells[:, 0] > _UNKNOWN]
+    if count is None:
+        columns, rows = (_lines(known[:, axis]) for axis in (0, 1))
+        grid = replace(grid, rows=rows, columns=columns)
     positions = np.zeros((grid.rows, grid.columns, 2), np.float32)
     found = np.zeros((grid.rows, grid.columns), bool)
-    if len(cells):
-        cells = cells - _fullest(cells, grid)
+    if len(known):
+        cells = cells - _fullest(known, grid)
         inside = ((cells >= 0) & (cells < [grid.columns, grid.rows])).all(1)
         column, row = cells[inside].T
         positions[row, column] = spots[inside]
         found[row, column] = True
-    if found.mean() < _LEAST_FOUND:
-        raise UserError(
-            f"only {found.sum()} of {found.size} markers are visible: check that the sensor has a "
-            f"marker gel of {grid.rows} x {grid.columns} dots and that nothing touches it"
-        )
-    if not found.all():
-        row, column = np.mgrid[: grid.rows, : grid.columns]
-        terms = np.stack([np.ones_like(row), column, row], -1).astype(np.float32)
-        plane = np.linalg.lstsq(terms[found], positions[found], rcond=None)[0]
-        positions[~found] = (terms @ plane)[~found]
-    return Markers(positions, found)
+        positions[~found] = _straight(positions, found)[~found]
+    return Markers(positions, found, size)
+
+
+def _lines(cells: Int[np.ndarray, " n"]) -> int:
+    """Return the number of rows, or columns, with at least half as many dots as the fullest one."""
+    if not len(cells):
+        return 0
+    full = np.bincount(cells - cells.min())
+    return int((2 * full >= full.max()).sum())
+
+
+def _is_grid(markers: Markers, grey: Grey) -> bool:
+    """Return whether spots are a grid that covers the image, rather than noise or a texture."""
+    places, found = markers.positions, markers.found
+    if found.sum() < _FEWEST or min(found.shape) < 3 or found.mean() < _LEAST_FOUND:
+        return False
+    height, width, _ = grey.shape
+    off = np.linalg.norm(places - _straight(places, found), axis=-1)[found]
+    spacing = np.median(np.linalg.norm(np.diff(places, axis=1), axis=-1))
+    wide = (np.ptp(places, (0, 1)) > _SPAN * np.array([width, height])).all()
+    return bool(wide and np.median(off) < _CROOKED * spacing)
+
+
+def _straight(positions: Dots, found: Flags) -> Dots:
+    """Return the straight lattice that fits the dots found best, px."""
+    row, column = np.indices(found.shape)
+    terms = np.stack([np.ones_like(row), column, row], -1).astype(np.float32)
+    return terms @ np.linalg.lstsq(terms[found], positions[found], rcond=None)[0]
+
+
+def without_dots(untouched: Image, sensor: SensorModel) -> Image:
+    """Paint a sensor's dots, if it has any, over in an untouched image; UserError if it shows none."""
+    grid = sensor.markers
+    if grid is None:
+        return untouched
+    dots = find_markers(untouched, grid, sensor.pixel_pitch)
+    return without_markers(untouched, dots.positions, dots.largest_radius(grid))
 
 
 def without_markers(
@@ -133,9 +197,9 @@ def _grey(image: Image) -> Grey:
     return cv2.transform(image.astype(np.float32), np.full((1, 3), 1 / 3, np.float32))[..., None]
 
 
-def _usual(darkness: Float32[np.ndarray, " n"], grid: MarkerGrid) -> float:
-    """Return the median darkness of the darkest spots, as many as the grid has dots."""
-    darkest = np.sort(darkness)[-grid.rows * grid.columns :]
+def _usual(darkness: Float32[np.ndarray, " n"], count: int) -> float:
+    """Return the median darkness of the darkest spots, `count` of them."""
+    darkest = np.sort(darkness)[-count:]
     return float(np.median(darkest)) if len(darkest) else 0.0
 
 
@@ -175,7 +239,7 @@ def _refined(grey: Grey, spots: Spots, radius: float) -> Spots:
 
 def _ordered(spots: Spots, pitch: float) -> Int[np.ndarray, "n 2"]:
     """Return (column, row) of each spot from the middlemost; far outside if not connected to it."""
-    cells = np.full((len(spots), 2), -(10**6))
+    cells = np.full((len(spots), 2), _UNKNOWN)
     if not len(spots):
         return cells
     apart = spots[None] - spots[:, None]
@@ -184,6 +248,8 @@ def _ordered(spots: Spots, pitch: float) -> Int[np.ndarray, "n 2"]:
     along = np.arctan2(apart[close][:, 1], apart[close][:, 0])
     # Steps on a lattice differ by right angles, so four times their angle is the same for all.
     angle = np.angle(np.exp(4j * along).sum()) / 4
+    if abs(angle) > _TURN:  # steps are the diagonals of a finer grid
+        return cells
     step = float(np.median(distance[close])) if close.any() else pitch
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     lattice = apart @ turn.T / step
@@ -194,7 +260,7 @@ def _ordered(spots: Spots, pitch: float) -> Int[np.ndarray, "n 2"]:
     reached = [start]
     for spot in reached:
         for other in np.flatnonzero(near[spot]):
-            if cells[other, 0] == -(10**6):
+            if cells[other, 0] == _UNKNOWN:
                 cells[other] = cells[spot] + hop[spot, other]
                 reached.append(int(other))
     return cells
@@ -202,14 +268,13 @@ def _ordered(spots: Spots, pitch: float) -> Int[np.ndarray, "n 2"]:
 
 def _fullest(cells: Int[np.ndarray, "n 2"], grid: MarkerGrid) -> Int[np.ndarray, "2"]:
     """Return the first (column, row) of the grid-sized window with most cells."""
-    real = cells[cells[:, 0] > -(10**6)]
     corners = [
         np.array([column, row])
-        for column in range(real[:, 0].min(), real[:, 0].max() + 1)
-        for row in range(real[:, 1].min(), real[:, 1].max() + 1)
+        for column in range(cells[:, 0].min(), cells[:, 0].max() + 1)
+        for row in range(cells[:, 1].min(), cells[:, 1].max() + 1)
     ]
     size = np.array([grid.columns, grid.rows])
-    return max(corners, key=lambda c: int(((real >= c) & (real < c + size)).all(1).sum()))
+    return max(corners, key=lambda c: int(((cells >= c) & (cells < c + size)).all(1).sum()))
 
 
 def _padded(image: np.ndarray, radius: float) -> tuple[np.ndarray, int]:

@@ -15,7 +15,13 @@ function make(tag, attributes, parent, text) {
 }
 
 function colorOf(name) {
-  return data.colors[name] === "#000000" ? "var(--main)" : data.colors[name];
+  const color = data.styles[name].color;
+  return color === "#000000" ? "var(--text)" : `color-mix(in srgb, ${color}, white var(--lift))`;
+}
+
+function strokeOf(name) {
+  const { linestyle, linewidth } = data.styles[name], dashes = linestyle === "-" ? [] : linestyle[1];
+  return `stroke:${colorOf(name)};stroke-width:${linewidth};stroke-dasharray:${dashes.map((d) => d * linewidth).join(" ") || "none"}`;
 }
 
 function number(value, digits = 2) {
@@ -31,7 +37,7 @@ function choose(episode) {
   byId("viewer").hidden = false;
   byId("name").textContent = episode.source;
   byId("facts").textContent = [episode.object, episode.outcome, `${episode.frames} frames at ${Number(episode.fps.toFixed(2))} per second`,
-    episode.contact === null ? "no contact found" : `first contact at frame ${episode.contact} (${episode.contact_source})`]
+    episode.contact_source === "no touch" ? "" : episode.contact === null ? "no contact found" : `first contact at frame ${episode.contact} (${episode.contact_source})`]
     .filter(Boolean).join(" · ");
   byId("slider").max = episode.frames - 1;
   drawImages();
@@ -45,13 +51,14 @@ function drawImages() {
   byId("images").replaceChildren();
   for (const [name, sheet] of Object.entries(chosen.sheets)) {
     const figure = make("figure", {}, byId("images"));
-    const height = 168, scale = height / sheet.height;
-    const image = make("div", { "data-sheet": name }, figure);
-    image.style.cssText = `width:${sheet.width * scale}px;background-image:url(${sheet.uri});` +
+    const scale = scaleOf(sheet), image = make("div", { "data-sheet": name }, figure);
+    image.style.cssText = `width:${sheet.width * scale}px;height:${sheet.height * scale}px;background-image:url(${sheet.uri});` +
       `background-size:${sheet.columns * sheet.width * scale}px auto`;
     make("figcaption", {}, figure, name.replace("_", " "));
   }
 }
+
+const scaleOf = (sheet) => Math.min(168 / sheet.height, byId("images").clientWidth / sheet.width);
 
 function place(div, sheet, k, scale) {
   const x = (k % sheet.columns) * sheet.width * scale, y = Math.floor(k / sheet.columns) * sheet.height * scale;
@@ -112,12 +119,12 @@ function drawChart() {
     make("text", { x: x + (right ? -5 : 5), y: MARGIN.top + 9, "text-anchor": right ? "end" : "start" }, chart, "contact");
   }
   for (const name of s.shown) {
-    const curve = chosen.curves[name], color = colorOf(name);
+    const curve = chosen.curves[name];
     const d = curve.map((v, k) => `${k ? "L" : "M"}${s.x(chosen.at[k]).toFixed(1)} ${s.y(v).toFixed(1)}`).join("");
-    make("path", { d, class: name === data.main ? "main" : "", style: `stroke:${color}` }, chart);
+    make("path", { d, style: strokeOf(name) }, chart);
     for (const peak of (name === byId("curve").value && chosen.peaks[name]) || []) {
       const x = s.x(peak), y = s.y(curve[nearest(chosen.at, peak)]) - 4;
-      make("path", { d: `M${x} ${y}l-4.5 -7h9z`, class: "peak", style: `fill:${color};stroke:none` }, chart);
+      make("path", { d: `M${x} ${y}l-4.5 -7h9z`, class: "peak", style: `fill:${colorOf(name)};stroke:none` }, chart);
     }
   }
   drawLegend();
@@ -128,7 +135,7 @@ function drawLegend() {
   for (const name of data.curves) {
     if (!chosen.curves[name]) continue;
     const item = make("li", { class: (name === data.main ? "main " : "") + (hidden.has(name) ? "off" : "") }, byId("legend"));
-    make("i", { style: `background:${colorOf(name)}` }, item);
+    make("line", { x1: 0, x2: 26, y1: 3, y2: 3, style: strokeOf(name) }, make("svg", { width: 26, height: 6 }, item));
     make("span", {}, item, name);
     make("b", { "data-curve": name }, item);
     item.onclick = () => {
@@ -146,7 +153,7 @@ function show(wanted) {
   const k = nearest(chosen.shown, frame), point = nearest(chosen.at, frame);
   for (const div of byId("images").querySelectorAll("[data-sheet]")) {
     const sheet = chosen.sheets[div.dataset.sheet];
-    place(div, sheet, k, 168 / sheet.height);
+    place(div, sheet, k, scaleOf(sheet));
   }
   const chart = byId("chart"), s = scales();
   chart.querySelectorAll(".cursor").forEach((node) => node.remove());
@@ -246,7 +253,7 @@ document.onkeydown = (event) => {
   else return;
   event.preventDefault();
 };
-window.onresize = () => { if (chosen) { drawChart(); show(frame); } };
+window.onresize = () => { if (chosen) { drawImages(); drawChart(); show(frame); } };
 drawTable();
 const named = decodeURIComponent(location.hash.slice(1));
 const first = data.episodes.find((e) => e.name === named) || data.episodes[0];
