@@ -30,6 +30,7 @@ from touchgoal.episodes.importers.labelled_videos import (
     firmest_frames,
     read_labelled_videos,
 )
+from touchgoal.rewards.distance.cost import text_distances
 from touchgoal.rewards.report.tables import aligned
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
@@ -93,7 +94,7 @@ def run(config: Config) -> dict[str, Any]:
     named["the same, hardness by depth"] = _by_folds(encoder, towers, videos, by_depth=True)
     rows = [{"row": name, **_judge(answers, videos)} for name, answers in named.items()]
     rng = np.random.default_rng(config.seed)
-    kinds = [(n, ranked) for n, ranked in _OWN if n < len(set(videos.objects))]
+    kinds = [kind for kind in _OWN if kind[0] < len(set(videos.objects))]
     few = [_with_few(encoder, towers, videos, *kind, rng) for kind in kinds]
     frequent = [float(np.bincount(column).max() / len(column)) for column in videos.ranks.T]
     result = {"rows": rows, "few": few, "most_frequent": frequent}
@@ -180,12 +181,13 @@ def _hardness(
 
 
 def _nearer(encoder: PooledEncoder, towers: Towers, videos: Videos, word: str) -> float:
-    """Return how often, of a video with most of a property and one with least, the right one is nearer."""
-    [goal] = encoder.embed_text_goal([f"a {word} surface"], towers)
-    near, k = videos.touch @ goal, _SURFACES[word]
+    """Return how often the right one of two videos, with most and least of a property, costs less."""
+    goal = encoder.embed_text_goal([f"a {word} surface"], towers)
+    distance, k = text_distances(videos.touch[:, None], goal)[:, 0], _SURFACES[word]
     true = RANK_WORDS[k].index(word)
-    right, wrong = (near[videos.ranks[:, k] == rank] for rank in (true, N_RANKS - 1 - true))
-    return float((right[:, None] > wrong).mean())
+    right, wrong = (distance[videos.ranks[:, k] == rank] for rank in (true, N_RANKS - 1 - true))
+    pairs = right[:, None] < wrong
+    return float(pairs.mean()) if pairs.size else float("nan")
 
 
 def _judge(answers: Int[np.ndarray, "n 3"], videos: Videos) -> dict[str, Any]:
