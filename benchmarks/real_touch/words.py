@@ -156,7 +156,10 @@ def _with_few(
     labelled: bool,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """Judge with few objects of one's own on all others, hardness by depth; mean over draws."""
+    """Judge with few objects of one's own on all others, hardness by depth; mean over draws.
+
+    Ranks of one's own objects give the share of each rank of hardness; else there are thirds.
+    """
     right, every = [], np.ones(len(videos.objects), bool)
     for _ in range(_DRAWS):
         own = np.isin(videos.objects, rng.choice(np.unique(videos.objects), number, replace=False))
