@@ -172,6 +172,13 @@ def materials(metrics: Metrics) -> str:
     return "{:.0%} [{:.0%}, {:.0%}]".format(row["accuracy"], *row["interval"])
 
 
+def properties(metrics: Metrics) -> str:
+    """Share of real videos with the right rank, by property, beside the most frequent answer."""
+    row, frequent = metrics["rows"][-1], [*metrics["most_frequent"], 0.0]
+    named = zip(row["right"].items(), frequent, strict=True)
+    return "; ".join(f"{k} {v:.2f}" + (f" ({most:.2f})" if most else "") for (k, v), most in named)
+
+
 def faults(metrics: Metrics) -> str:
     """Faults that lose no episode, and the longest time to rest."""
     rows = metrics["rows"]

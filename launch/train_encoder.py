@@ -142,7 +142,8 @@ class Adapt:
 
     data: Path
     """Folder with videos/ and labels.csv in PhysiCLeAR's layout; its splits train and unlabelled are
-    used. Where labels.csv ranks hardness, roughness and bumpiness, the encoder also learns sentences."""
+    used. Where labels.csv ranks hardness, roughness and bumpiness, sentences fitted to the ranks replace
+    the encoder's."""
     encoder: str = "gelsight_mini"
     """Encoder to adapt: a name, or its folder."""
     towers: str = "offline"

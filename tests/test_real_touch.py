@@ -7,9 +7,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.published_touch.force_grasps import read_force_grasps
+<<<<<<< HEAD
 from benchmarks.real_touch import forces, markers, touch_spectrum
+=======
+from benchmarks.real_touch import forces, markers, words
+>>>>>>> words
 from benchmarks.real_touch.embedders import find_embedder
 from benchmarks.real_touch.property_probe import (
     adapted_nearest_is_same,
@@ -19,8 +24,10 @@ from benchmarks.real_touch.property_probe import (
 )
 from benchmarks.real_touch.videos import Config, run
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
-from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.pretrained import load_encoder, load_pooled_encoder
 from touchgoal.encoders.towers.towers import OfflineTowers
+from touchgoal.encoders.whitening.adapt import centre
+from touchgoal.encoders.whitening.text_head import rank_sentences
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video
 from touchgoal.launch.__main__ import main
@@ -84,6 +91,7 @@ def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
     assert apart(adapted) < 0.7 * apart(load_encoder("gelsight_mini"))
 
 
+<<<<<<< HEAD
 def test_the_spectrum_of_touches(tmp_path: Path) -> None:
     """A wave's power is in its own band; waves pressed on a DIGIT and simulated presses are read."""
     for i, band in enumerate(touch_spectrum.BANDS):  # 4.62: where a difference of Gaussians peaks
@@ -106,6 +114,28 @@ def test_the_spectrum_of_touches(tmp_path: Path) -> None:
     assert (real.powers.argmax(1) == 2).all()
     made = touch_spectrum.simulated_touches("digit", surfaces=3, seed=0)
     assert len(made.powers) and (made.powers.argmax(1) >= 2).all()  # that unit is out of focus
+=======
+def test_words_stay_right_where_all_touches_lie_to_one_side() -> None:
+    """Touches exactly towards three sentences, and an offset that makes all of them rough."""
+    encoder, towers = load_pooled_encoder("gelsight_mini"), OfflineTowers()
+    goals = encoder.embed_text_goal(rank_sentences(1), towers)
+    shift = 3 * goals[2] - 0.5 * goals.sum(0)
+    features = (goals + shift) @ np.linalg.inv(encoder.whitening.numpy()) + encoder.mean.numpy()
+    touches = [torch.from_numpy(row[None]) for row in features]
+    assert words.name_ranks(encoder, towers, touches)[:, 1].tolist() == [2, 2, 2]
+    centred = centre(encoder, touches, np.arange(3))
+    assert words.name_ranks(centred, towers, touches)[:, 1].tolist() == [0, 1, 2]
+
+
+def test_words_are_judged_by_answers(clips: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(words, "_DRAWS", 1)
+    result = words.run(words.Config(data=clips))
+    assert result["most_frequent"] == pytest.approx([0.4, 0.4, 1.0])
+    shipped, _, _ = result["rows"]
+    assert [sum(answers) for answers in shipped["answers"]] == [15, 15, 15]
+    assert shipped["right"]["bumpiness"] == pytest.approx(shipped["answers"][2][1] / 15)
+    assert [row["objects"] for row in result["few"]] == [1, 3]
+>>>>>>> words
 
 
 def test_sentences_are_judged_on_objects_never_seen() -> None:
