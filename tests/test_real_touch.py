@@ -10,11 +10,7 @@ import pytest
 import torch
 
 from benchmarks.published_touch.force_grasps import read_force_grasps
-<<<<<<< HEAD
-from benchmarks.real_touch import forces, markers, touch_spectrum
-=======
-from benchmarks.real_touch import forces, markers, words
->>>>>>> words
+from benchmarks.real_touch import forces, markers, touch_spectrum, words
 from benchmarks.real_touch.embedders import find_embedder
 from benchmarks.real_touch.property_probe import (
     adapted_nearest_is_same,
@@ -91,7 +87,6 @@ def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
     assert apart(adapted) < 0.7 * apart(load_encoder("gelsight_mini"))
 
 
-<<<<<<< HEAD
 def test_the_spectrum_of_touches(tmp_path: Path) -> None:
     """A wave's power is in its own band; waves pressed on a DIGIT and simulated presses are read."""
     for i, band in enumerate(touch_spectrum.BANDS):  # 4.62: where a difference of Gaussians peaks
@@ -114,7 +109,8 @@ def test_the_spectrum_of_touches(tmp_path: Path) -> None:
     assert (real.powers.argmax(1) == 2).all()
     made = touch_spectrum.simulated_touches("digit", surfaces=3, seed=0)
     assert len(made.powers) and (made.powers.argmax(1) >= 2).all()  # that unit is out of focus
-=======
+
+
 def test_words_stay_right_where_all_touches_lie_to_one_side() -> None:
     """Touches exactly towards three sentences, and an offset that makes all of them rough."""
     encoder, towers = load_pooled_encoder("gelsight_mini"), OfflineTowers()
@@ -135,7 +131,6 @@ def test_words_are_judged_by_answers(clips: Path, monkeypatch: pytest.MonkeyPatc
     assert [sum(answers) for answers in shipped["answers"]] == [15, 15, 15]
     assert shipped["right"]["bumpiness"] == pytest.approx(shipped["answers"][2][1] / 15)
     assert [row["objects"] for row in result["few"]] == [1, 3]
->>>>>>> words
 
 
 def test_sentences_are_judged_on_objects_never_seen() -> None:
