@@ -94,6 +94,12 @@ def encoder_speed(metrics: Metrics) -> str:
     return f"{row['encoder']} {rates}"
 
 
+def spectrum(metrics: Metrics) -> str:
+    """The band in which simulated touches are farthest from held-out real ones, by sensor."""
+    off = {r["sensor"]: r["simulated_db"] for r in metrics["rows"] if r["touches"].endswith("out")}
+    return "; ".join(f"{sensor} {max(decibel, key=abs):+.1f} dB" for sensor, decibel in off.items())
+
+
 def realism(metrics: Metrics) -> str:
     """Median PSNR, beside Taxim's table."""
 
