@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE
+from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.preprocess import check_images
 from touchgoal.encoders.pretrained import AnyTouchEncoder
@@ -204,9 +205,11 @@ class Reward:
         check_goals(assigned, inputs)
         embedder = self.embedder(inputs)
         check_words(specs, embedder.encoder is None or embedder.knows_words)
+        if "force" in assigned and embedder.made_with.sensor not in SENSORS:
+            raise UserError(f"goal '{assigned['force']}': force is not read from an unknown sensor")
         normalizer, value, note = self._choose_normalizer(inputs, assigned, embedder)
         parts = normalizer is not None and bool(normalizer.unit) and not self._plain
-        if not parts:
+        if not parts and "force" not in assigned:
             embedder = self.embedder(inputs, parts=False)
         return PreparedReward(embedder, assigned, normalizer, value, note, self._plain)
 

@@ -1,6 +1,7 @@
 """Cost of an embedded trajectory to a goal: its parts, and MMWand's plain distances (section V-E).
 
-Plain distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over the fingertips.
+Plain distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over the fingertips. That
+of a force goal is the difference in force over the goal's: 1 without contact, 0 at the goal.
 """
 
 from collections.abc import Mapping
@@ -11,10 +12,12 @@ from jaxtyping import Float, Float32
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.distance.parts import (
+    FORCE,
     VALUE,
     WORDS,
     Costs,
     cosine_distances,
+    force_distances,
     mean_products,
     part_costs,
     smooth_and_fuse,
@@ -50,6 +53,9 @@ def compute_curves(
     """
     # normalizers were fitted on the distances of incomplete touches
     raw = plain_distances(episode.features, goal.features, completed=normalizer is None)
+    if FORCE in goal.forms:
+        wanted = goal.features[FORCE]
+        raw[FORCE] = force_distances(episode.features[FORCE], wanted)[:, 0] / float(wanted.mean())
     same = goal.same_episode
     normalised: Costs = {}
     parts: Costs = {}
