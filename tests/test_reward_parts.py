@@ -129,19 +129,18 @@ def test_a_failure_of_each_part_raises_that_part(
 def test_a_force_is_a_goal(
     successes: list[EmbeddedEpisode], normalizer: DistanceNormalizer
 ) -> None:
-    """Alone or beside a touch, whose own force it replaces; without a normalizer it has no unit."""
+    """Alone or beside a touch, whose own force it replaces; its unit is half of it."""
     newtons, forms = {"force": np.full((1, 2), 8, np.float32)}, {"force": "force:8"}
     mine, alone = embedded(9, force=12.0), EmbeddedGoal(newtons, forms)
     costs = compute_curves(mine, alone, normalizer)
     assert costs.parts.keys() == {"force", "fused"} and costs.plain.keys() == {"force"}
     assert costs.parts["force"][:GRASP] == pytest.approx(np.ones(GRASP))
+    assert costs.parts["force"][-1] == pytest.approx(0.31, abs=0.1)  # 4^2 / (4^2 + 6^2)
     raw = compute_curves(mine, alone, None).costs["force"]
     assert raw[:GRASP] == pytest.approx(np.ones(GRASP)) and raw[-1] == pytest.approx(0.5, abs=0.15)
     touch = EmbeddedGoal({**last_rows([successes[0]]), **newtons}, forms)
     beside = compute_curves(mine, touch, normalizer).parts
     assert beside["force"] == pytest.approx(costs.parts["force"]) and "object" in beside
-    with pytest.raises(UserError, match="it has no 'force'"):
-        compute_curves(mine, alone, replace(normalizer, unit={}))
 
 
 def test_before_contact_the_fingertips_cost_the_same_whatever_they_read(
@@ -178,12 +177,8 @@ def test_distances_by_hand() -> None:
 
     light = readings([True, False], [9.5, 0], [3e-3, 0])
     d = contact_distances(light, readings([True], [39.5], [0]))
-    assert part_distances(light, {"force": np.full((1, 1), 39.5, np.float32)})["force"][
-        :, 0
-    ].tolist() == [
-        30,
-        39.5,
-    ]
+    wanted = {"force": np.full((1, 1), 39.5, np.float32)}
+    assert part_distances(light, wanted)["force"][:, 0].tolist() == [30, 39.5]
     assert d["centre"][:, 0] == pytest.approx([3e-3, 0.02]) and d["held"][:, 0].tolist() == [0, 1]
     along, short = np.array([[[1.0, 0]]], np.float32), np.array([[[0.5, 0]]], np.float32)
     assert object_distances(along, along)[0, 0] == 0

@@ -71,8 +71,8 @@ class DistanceNormalizer:
 
     n(d) = (d - goal) / (start - goal): 1 at the usual start, 0 at the usual end, below 0 nearer than
     that. There is one pair of medians for each `median_name`. The unit of a part of the cost
-    (`distance.parts`) is the spread of its distance among successful ends. The plain distance to a
-    force goal is normalised as it is.
+    (`distance.parts`) is the spread of its distance among successful ends. A force
+    goal needs neither: see `distance.cost`.
     """
 
     start: dict[str, float]  # median raw distance of the start of a training episode to a goal
@@ -92,19 +92,17 @@ class DistanceNormalizer:
         A plain video counts as taken by the camera that the normalizer was fitted on. The goal of a
         modality in `same_episode` is a frame of the measured episode itself.
         """
-        mine, names = self.source, set(modalities)
+        mine, names = self.source, set(modalities) - {"force"}
         for m in sorted(names):
-            known = self.unit if m == "force" else self.start
-            if (name := median_name(m, m in same_episode)) not in known:
+            if (name := median_name(m, m in same_episode)) not in self.start:
                 return f"it has no '{name}', only {', '.join(self.start)}"
         pairs = []
         if "image" in names:
             pairs.append(("towers", mine.towers, source.towers))
             if source.camera:
                 pairs.append(("camera", mine.camera, source.camera))
-        if names & {"tactile", "text", "force"}:
-            pairs.append(("sensor", mine.sensor, source.sensor))
         if names & {"tactile", "text"}:
+            pairs.append(("sensor", mine.sensor, source.sensor))
             pairs.append(("touch encoder", mine.encoder, source.encoder))
         for what, fitted, measured in pairs:
             if fitted != measured:
