@@ -109,9 +109,14 @@ def realism(metrics: Metrics) -> str:
 
 
 def real_force(metrics: Metrics) -> str:
-    """Median force error with its interval."""
+    """Median force error with its interval, the largest bias, and how costs follow the error."""
     low, high = metrics["median_error_interval"]
-    return f"{metrics['median_error']:.2f} N [{low:.2f}, {high:.2f}]"
+    bias = max(map(abs, metrics["bias"].values()))
+    followed = [f"{row['force']:.2f}" for row in metrics["followed"]["gelsight_mini"].values()]
+    return (
+        f"{metrics['median_error']:.2f} N [{low:.2f}, {high:.2f}]; largest bias of an object {bias:.1f} N; "
+        f"cost of a force goal follows the error at {', '.join(followed)} (3, 8, 15 N)"
+    )
 
 
 def markers(metrics: Metrics) -> str:
