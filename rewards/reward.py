@@ -205,8 +205,10 @@ class Reward:
         check_goals(assigned, inputs)
         embedder = self.embedder(inputs)
         check_words(specs, embedder.encoder is None or embedder.knows_words)
-        if "force" in assigned and embedder.made_with.sensor not in SENSORS:
-            raise UserError(f"goal '{assigned['force']}': force is not read from an unknown sensor")
+        if "force" in assigned:
+            sensor = SENSORS.get(embedder.made_with.sensor)
+            if why_not := "the sensor is unknown" if sensor is None else sensor.images_only:
+                raise UserError(f"goal '{assigned['force']}': {why_not}")
         normalizer, value, note = self._choose_normalizer(inputs, assigned, embedder)
         parts = normalizer is not None and bool(normalizer.unit) and not self._plain
         if not parts and "force" not in assigned:
