@@ -115,9 +115,14 @@ def realism(metrics: Metrics) -> str:
 
 
 def real_force(metrics: Metrics) -> str:
-    """Median force error with its interval."""
+    """Median force error with its interval, largest bias of an object, correlation by force goal."""
     low, high = metrics["median_error_interval"]
-    return f"{metrics['median_error']:.2f} N [{low:.2f}, {high:.2f}]"
+    bias = max(map(abs, metrics["bias"].values()))
+    followed = [f"{row['force']:.2f}" for row in metrics["followed"]["gelsight_mini"].values()]
+    return (
+        f"{metrics['median_error']:.2f} N [{low:.2f}, {high:.2f}]; largest bias {bias:.1f} N; "
+        f"cost follows force {', '.join(followed)}"
+    )
 
 
 def markers(metrics: Metrics) -> str:

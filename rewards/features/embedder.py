@@ -45,6 +45,7 @@ from touchgoal.rewards.goals import (
     GoalImage,
     Goals,
     GoalSpec,
+    GripForce,
     OwnFrame,
     Sentence,
     TouchArrays,
@@ -200,6 +201,8 @@ class EpisodeEmbedder:
             features[TEXT] = self.embed_sentences([text.text])
             if text.baseline:
                 features[TEXT_BASELINE] = self.embed_sentences([text.baseline])
+        if isinstance(force := goals.get("force"), GripForce):
+            features["force"] = np.full((1, len(own.sides)), force.newtons, np.float32)
         forms = {name: str(spec) for name, spec in goals.items()}
         return EmbeddedGoal(features, forms, same_episode(goals))
 
