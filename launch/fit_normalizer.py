@@ -94,7 +94,8 @@ def main(config: Config) -> None:
     ]
     calibration = embedded[len(embedded) - config.success_from :]
     embedded = embedded[: len(embedded) - config.success_from]
-    modalities = config.modalities or tuple(m for m in embedded[0].modalities if m != "text")
+    own: list[Modality] = [m for m in embedded[0].modalities if m != "text"]
+    modalities = config.modalities or own
     normalizer = fit_normalizer(embedded, modalities, inputs.scene)
     value = fit_value(embedded, inputs.fitted_task) if config.value else None
     ends = SuccessfulEnds.of(embedded)
