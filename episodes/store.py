@@ -30,12 +30,7 @@ from touchgoal.episodes.format.episode_table import EpisodePlace
 from touchgoal.episodes.format.foreign import foreign_file, refusal
 from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.episodes.format.repair import unlisted_files
-from touchgoal.episodes.keys import (
-    guess_keys,
-    note_guess,
-    readable_features,
-    stored_names,
-)
+from touchgoal.episodes.keys import guess_keys, note_guess, readable_features, stored_names
 from touchgoal.episodes.media import decode_video, video_checksum, video_length
 from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue
 from touchgoal.runtime.atomic_write import write_file

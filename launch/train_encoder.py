@@ -11,12 +11,7 @@ from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.ssl import config as ssl
 from touchgoal.encoders.training.options import SetTrainerOptions
 from touchgoal.launch.support.align_options import Align, Preset, presets
-from touchgoal.runtime.option_types import (
-    RARE,
-    Count,
-    Seed,
-    checked_dataclass,
-)
+from touchgoal.runtime.option_types import RARE, Count, Seed, checked_dataclass
 
 _GRASP_FRAMES = 24  # frames with contact taken from each episode of a grasp, both fingertips
 

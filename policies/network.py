@@ -19,11 +19,7 @@ from touchgoal.policies.actions import (
     to_representation,
 )
 from touchgoal.policies.config import ActionRepresentation, TouchInput
-from touchgoal.policies.heads.diffusion import (
-    Diffusion,
-    DiffusionConfig,
-    Regression,
-)
+from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig, Regression
 from touchgoal.policies.heads.mlp import MLPConfig, readout
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
