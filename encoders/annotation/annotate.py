@@ -5,11 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from touchgoal.encoders.annotation import records
+from touchgoal.encoders.annotation import matching, records
 from touchgoal.encoders.annotation.boxes import Box, Image, crop
 from touchgoal.encoders.annotation.config import AnnotationSettings
-from touchgoal.encoders.annotation.frame_matching import match_contact, match_reference
-from touchgoal.encoders.annotation.instance_matching import match_instance, select_instances
 from touchgoal.encoders.annotation.models import AnnotationModels
 from touchgoal.encoders.annotation.sensor_tracking import track_csrt
 from touchgoal.episodes.importers.visgel import VisGelRecording
@@ -73,17 +71,17 @@ def annotate(
     """
     touches = (_read(root / touch) for _, touch in recording.steps)
     reference_touch = root / recording.reference[1]
-    contact = match_contact(touches, _read(reference_touch), _MIN_DEFORMATION)
+    contact = matching.match_contact(touches, _read(reference_touch), _MIN_DEFORMATION)
     contact_image, touch = recording.steps[contact.index]
     video = _video_until(recording, contact_image)
     sensor = _track_sensor([root / name for name in video], models, settings)
-    chosen = match_reference(sensor)
+    chosen = matching.match_reference(sensor)
     at_contact = sensor[-1]
     assert at_contact is not None  # match_reference has checked it
     image = _read(root / video[chosen])
     detections = models.detect(image, "object")
-    kept, dropped = select_instances(detections, sensor[chosen], settings.min_score)
-    touched, overlap = match_instance(kept, at_contact, settings.min_overlap)
+    kept, dropped = matching.select_instances(detections, sensor[chosen], settings.min_score)
+    touched, overlap = matching.match_instance(kept, at_contact, settings.min_overlap)
     instances = tuple(
         records.Instance(d.box, d.score, models.caption(crop(image, d.box), _CAPTION_PROMPT))
         for d in kept
