@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -104,10 +104,7 @@ class OfflineTowers:
     @cached_property
     def image_weights(self) -> str:
         """Short hash of the ImageNet network's weights."""
-        digest = hashlib.sha256()
-        for weight in self.image_tower.state_dict().values():
-            digest.update(weight.cpu().numpy().tobytes())
-        return digest.hexdigest()[:12]
+        return _hash(self.image_tower.state_dict().values())
 
     @cached_property
     def text_tower(self) -> minilm.SentenceEncoder:
@@ -179,7 +176,8 @@ class ClipTowers:
         )
         self._context: int = self._model.config.text_config.max_position_embeddings
         self.image_dim = self.text_dim = int(self._model.config.projection_dim)
-        self.name = f"{source}#{_weights_hash(self._model)}"
+        projections = self._model.visual_projection.weight, self._model.text_projection.weight
+        self.name = f"{source}#{_hash(projections)}"
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
@@ -246,9 +244,9 @@ def _joined(batches: list[Tensor], width: int) -> Tensor:
     return torch.cat(batches) if batches else torch.empty(0, width)
 
 
-def _weights_hash(model: Any) -> str:
-    """Return 12 hex digits of a hash of both projections."""
+def _hash(weights: Iterable[Tensor]) -> str:
+    """Return 12 hex digits of a hash of weights."""
     digest = hashlib.sha256()
-    for layer in (model.visual_projection, model.text_projection):
-        digest.update(layer.weight.detach().cpu().numpy().tobytes())
+    for weight in weights:
+        digest.update(weight.detach().cpu().numpy().tobytes())
     return digest.hexdigest()[:12]

@@ -174,9 +174,7 @@ def unreadable(root: Path, name: str, error: Exception) -> UserError:
     return UserError(f"{root / name} is corrupt ({reason}): {repair_command(root)}")
 
 
-def last_row(table: pa.Table | None) -> Row:
-    """Return the last row of meta/episodes without statistics, or {} without a table."""
-    if table is None:
-        return {}
+def last_row(table: pa.Table) -> Row:
+    """Return the last row of meta/episodes without statistics."""
     names = [name for name in table.column_names if not name.startswith("stats/")]
     return table.select(names).slice(table.num_rows - 1).to_pylist()[0]
