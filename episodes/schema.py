@@ -149,9 +149,3 @@ def _video_info(shape: list[int], fps: int) -> dict[str, Any]:
         "is_depth_map": False,
         "has_audio": False,
     }
-
-
-def drop_pixel_format(features: dict[str, dict[str, Any]]) -> None:
-    """Remove `video.pix_fmt`, which sets of older versions name and lerobot's own tools reject."""
-    for feature in features.values():
-        (feature.get("info") or {}).pop("video.pix_fmt", None)

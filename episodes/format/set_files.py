@@ -9,7 +9,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from touchgoal.control.sensors.clip import refuse_other_format
-from touchgoal.episodes.schema import drop_pixel_format
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.json_file import parse_json
 
@@ -119,7 +118,6 @@ def load_info(root: Path) -> dict[str, Any]:
     if wrong:
         raise unreadable(root, INFO, ValueError(f"wrong {', '.join(wrong)}"))
     _check_paths(root, info)
-    drop_pixel_format(info["features"])
     return info
 
 

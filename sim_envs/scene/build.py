@@ -17,7 +17,7 @@ from touchgoal.control.motion.tracker import SERVO_DAMPING
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.config import MAX_CAMERA_SIDE, CameraPlacement, SceneConfig
+from touchgoal.sim_envs.config import MAX_CAMERA_SIDE, SceneConfig
 from touchgoal.sim_envs.scene.objects import FIRM, Body
 
 SIDES = ("left", "right")
@@ -54,7 +54,10 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
     _add_cameras_and_table(spec, ROBOTS[config.arm].tool)
     for name, placement in (("front", config.front_camera), ("wrist", config.wrist_camera)):
         if placement is not None:
-            _place_camera(spec.camera(name), placement)
+            camera, (*pos, w, x, y, z, fovy) = spec.camera(name), placement
+            camera.pos, camera.fovy = np.array(pos), fovy
+            # Half a turn about x: MuJoCo's cameras look along -z and have y up.
+            camera.quat = np.array([-x, w, z, -y])
     for body in bodies:
         add_body(spec, body)
     return spec
@@ -278,13 +281,6 @@ def _add_cameras_and_table(spec: mujoco.MjSpec, tool: Tool) -> None:
         conaffinity=0,
         group=VISUAL_GROUP,
     )
-
-
-def _place_camera(camera: mujoco.MjsCamera, placement: CameraPlacement) -> None:
-    *pos, w, x, y, z, fovy = placement
-    camera.pos, camera.fovy = np.array(pos), fovy
-    # Half a turn about x: MuJoCo's cameras look along -z and have y up.
-    camera.quat = np.array([-x, w, z, -y])
 
 
 _GEOM_TYPES = {
