@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.encoders.annotation import matching, records
-from touchgoal.encoders.annotation.boxes import Box, Image, crop
+from touchgoal.encoders.annotation.boxes import Box, Image, crop, track_csrt
 from touchgoal.encoders.annotation.config import AnnotationSettings
 from touchgoal.encoders.annotation.models import AnnotationModels
-from touchgoal.encoders.annotation.sensor_tracking import track_csrt
 from touchgoal.episodes.importers.visgel import VisGelRecording
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.image_file import read_image

@@ -4,8 +4,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from touchgoal.encoders.annotation.boxes import Detection, Image, area, clipped
-from touchgoal.encoders.annotation.sensor_tracking import TRACKER
+from touchgoal.encoders.annotation.boxes import TRACKER, Detection, Image, area, clipped
 from touchgoal.encoders.towers.transformers_models import load_model, load_part
 
 _LOWEST_SCORE = 0.05  # boxes below are background; the others are counted as low confidence

@@ -45,17 +45,6 @@ class Towers(Protocol):
         ...
 
 
-@runtime_checkable
-class MapTowers(Towers, Protocol):
-    """Towers that also say where in an image something is."""
-
-    def embed_with_maps(
-        self, images: UInt8[np.ndarray, "n h w 3"]
-    ) -> tuple[Float[Tensor, "n d"], Float16[np.ndarray, "n c y x"]]:
-        """Return embeddings as `embed_images`, and feature maps at stride 16, by one pass."""
-        ...
-
-
 def load_towers(name: str, device: str = "cpu") -> Towers:
     """Load towers: "offline", a CLIP's Hugging Face id or folder, or the `name` of loaded ones.
 

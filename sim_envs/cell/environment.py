@@ -17,8 +17,7 @@ from touchgoal.sim_envs.cell.deployed_arm import DeployedArm
 from touchgoal.sim_envs.cell.deployment import IDEAL_DEPLOYMENT
 from touchgoal.sim_envs.cell.estimated_wrench import ForceMonitor
 from touchgoal.sim_envs.cell.hardware import SimulatedHardware
-from touchgoal.sim_envs.config import SETPOINT_PERIOD, EnvConfig
-from touchgoal.sim_envs.options import with_options
+from touchgoal.sim_envs.config import SETPOINT_PERIOD, EnvConfig, with_options
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, PadContact
 from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.tactile.pad import TactileFrame
