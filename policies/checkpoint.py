@@ -146,11 +146,8 @@ def find_policy(name_or_path: str | Path, task: str = "") -> Path:
         if task not in SHIPPED_POLICIES:
             raise UserError(f"no policy ships for {task}: train one, or take the expert")
         return SHIPPED_POLICIES[task]
-    for folder in (
-        folders.get(name),
-        Path(name),
-        Path(name) / "policy",
-    ):  # train-policy's --out, too
+    # train-policy's --out holds the folder `policy`
+    for folder in (folders.get(name), Path(name), Path(name) / "policy"):
         if folder and POLICY_FORMAT.weights_path(folder).is_file():
             return folder
     if Path(name).is_dir():

@@ -93,18 +93,16 @@ class SensorRandomization:
     0.39). The others: differences between published calibrations.
     """
 
-    gain: Annotated[NotNegative, Field(le=0.3)] = (
-        0.047  # standard deviation of each colour channel's
-    )
+    # Standard deviation of each colour channel's.
+    gain: Annotated[NotNegative, Field(le=0.3)] = 0.047
     # Standard deviations of a constant and of a smooth pattern added to the untouched image, of 255.
     offset: NotNegative = 2.4
     pattern: NotNegative = 2.4
     azimuth: Annotated[NotNegative, Field(le=180)] = 15.0  # largest turn of each light, degrees
     blur: Fraction = 0.3  # largest relative change of the gel's smoothing of an imprint
     pixel_pitch: bool = True  # draw the millimetres per pixel from the sensor model's range
-    markers: Fraction = (
-        0.1  # largest shift of dots, share of their spacing, and change of their size
-    )
+    # Largest shift of dots, share of their spacing, and change of their size.
+    markers: Fraction = 0.1
 
 
 NO_RANDOMIZATION = SensorRandomization(
@@ -274,10 +272,8 @@ class BeadMazeConfig(EnvConfig):
     """Range of the force of each finger, N."""
     start_angle: Annotated[NotNegative, Field(le=45)] = 0.0
     """Largest angle between hand and wire at the start, degrees."""
-    wire_friction: Annotated[tuple[Friction, Friction], ORDERED, FIXED] = (
-        0.15,
-        0.25,
-    )  # bead on wire
+    # Of the bead on the wire.
+    wire_friction: Annotated[tuple[Friction, Friction], ORDERED, FIXED] = (0.15, 0.25)
     stall_seconds: Annotated[Positive, FIXED] = 5.0  # s without 2 mm of progress: jammed
 
     def chosen_wires(self, count: int | None = None) -> list[Wire]:
