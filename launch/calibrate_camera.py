@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from touchgoal.control.cell.config import CellConfig
     from touchgoal.control.cell.connection import CellConnection
     from touchgoal.control.hand_eye.board import Board
-    from touchgoal.control.hand_eye.record import View
-    from touchgoal.control.hand_eye.solve import HandEye
+    from touchgoal.control.hand_eye.solve import HandEye, View
 
 Side = Annotated[int, Field(ge=3, le=10)]
 
@@ -70,7 +69,7 @@ def main(config: Config) -> None:
 def _calibrate(config: Config, path: Path, board: "Board") -> None:
     from touchgoal.control.cell.cell_file import read_cell_file
     from touchgoal.control.deployment.preflight import check_client
-    from touchgoal.control.hand_eye.record import calibrate_camera
+    from touchgoal.control.hand_eye.solve import calibrate_camera
     from touchgoal.launch.support.cell_run import connect
     from touchgoal.launch.support.confirm import confirm
     from touchgoal.runtime.run_folder import open_run
@@ -95,7 +94,7 @@ def _views(
 ) -> "Iterator[View]":
     """Yield the views that show the board, and say of each how much of it."""
     from touchgoal.control import features as ft
-    from touchgoal.control.hand_eye.record import take_view
+    from touchgoal.control.hand_eye.solve import take_view
 
     count = 0
     places = _by_hand() if config.poses is None else _moved(config.poses, cell, connection)

@@ -41,9 +41,7 @@ def _ordered(bounds: tuple[Number, Number]) -> tuple[Number, Number]:
     return bounds
 
 
-ORDERED = AfterValidator(_ordered)
-PositiveRange = Annotated[tuple[Positive, Positive], ORDERED]
-"""Lower and upper bound; equal bounds fix the value."""
+ORDERED = AfterValidator(_ordered)  # of lower and upper bound; equal bounds fix the value
 
 
 class OptionError(UserError):

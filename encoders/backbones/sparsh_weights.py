@@ -124,7 +124,7 @@ def _read(path: Path) -> Mapping[str, Any]:
             scripted = any(name.endswith("constants.pkl") for name in archive.namelist())
         if scripted:
             raise UserError(f"{path} is a program of TorchScript, not weights")
-        pickles: Any = SimpleNamespace(Unpickler=_TensorUnpickler)
+        pickles: Any = SimpleNamespace(__name__="pickles", Unpickler=_TensorUnpickler)
         found = torch.load(path, "cpu", pickle_module=pickles, weights_only=False, mmap=True)
     except UserError:
         raise
