@@ -1,6 +1,7 @@
 """MJPEG streams over HTTP: live images in any browser, for machines with and without a screen."""
 
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -47,7 +48,7 @@ class Stream:
 class StreamServer:
     """Serves streams at `http://host:port/NAME`; `port` 0: any that is free."""
 
-    def __init__(self, streams: dict[str, Stream], host: str, port: int) -> None:
+    def __init__(self, streams: Mapping[str, Stream], host: str, port: int) -> None:
         """`port` 0: any that is free. Raises OSError if it is taken."""
         self._streams = streams
         handler = type("Handler", (_Handler,), {"streams": streams})
@@ -80,7 +81,7 @@ class LiveImage(StreamServer):
 class _Handler(BaseHTTPRequestHandler):
     """Sends one stream to one client until either is gone."""
 
-    streams: dict[str, Stream]
+    streams: Mapping[str, Stream]
 
     def do_GET(self) -> None:  # noqa: N802, the base class's name
         stream = self.streams.get(self.path.strip("/"))

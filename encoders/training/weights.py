@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import GenericAlias
 from typing import Any, TypeVar
 
 import torch
@@ -90,8 +91,9 @@ class WeightsFormat:
         """
         try:
             fields = dict(self.read_json(directory)["config"])
-            kind: Any = kinds if isinstance(kinds, type) else kinds[fields.pop("kind")]
-            return TypeAdapter(tuple[kind], config=_EXACT).validate_python([fields])[0]
+            kind = kinds if isinstance(kinds, type) else kinds[fields.pop("kind")]
+            inside = TypeAdapter(GenericAlias(tuple, (kind,)), config=_EXACT)
+            return inside.validate_python([fields])[0]
         except (KeyError, TypeError, ValidationError) as error:
             wrong = first_problem(error) if isinstance(error, ValidationError) else str(error)
             raise UserError(

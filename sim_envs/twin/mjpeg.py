@@ -31,8 +31,8 @@ class Stream(live_image.Stream):
 
     def publish(self, image: Image) -> None:
         """Publish an image to all clients."""
-        frozen = time.monotonic() < self.frozen and self.image is not None
-        super().publish(self.image if frozen else image)
+        frozen = self.image if time.monotonic() < self.frozen else None
+        super().publish(image if frozen is None else frozen)
 
     def wait_until_sent(self) -> None:
         """Wait until the last image is on its way to its clients."""
