@@ -16,6 +16,7 @@ import tyro
 from pydantic import Field
 
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.option_types import Positive, checked_dataclass
 
 if TYPE_CHECKING:
@@ -151,7 +152,6 @@ def _read_poses(path: Path, n_joints: int) -> list[Any]:
 
 def _save_views(views: "list[View]", out: Path) -> None:
     from touchgoal.runtime.image_file import write_image
-    from touchgoal.runtime.json_file import write_json
 
     for i, view in enumerate(views):
         write_image(out / f"view_{i:02d}.png", view.image)
@@ -163,7 +163,6 @@ def _report(result: "HandEye", config: Config, cell_file: Path, out: Path, rows:
 
     from touchgoal.control.cell.camera_pose import camera_lines, write_camera
     from touchgoal.control.deployment.observation import quaternion
-    from touchgoal.runtime.json_file import write_json
 
     mm, degrees = 1e3 * result.position_errors, np.degrees(result.rotation_errors)
     closed = result.closed_form[:3, 3] - result.pose[:3, 3]

@@ -205,10 +205,8 @@ def imagenet_pixels(images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n 3 
 
 def imagenet_normalised(pixels: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n 3 y x"]:
     """Normalise pixels of 0 to 1 as for ImageNet."""
-    mean, std = (
-        torch.tensor(values, device=pixels.device)[:, None, None]
-        for values in (_IMAGENET_MEAN, _IMAGENET_STD)
-    )
+    values = torch.tensor([_IMAGENET_MEAN, _IMAGENET_STD], device=pixels.device)
+    mean, std = values[:, :, None, None]
     return (pixels - mean) / std
 
 

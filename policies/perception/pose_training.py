@@ -245,10 +245,8 @@ def _errors(
     target: Int64[Tensor, " n"],
     words: Float[Tensor, "n d"],
 ) -> dict[str, Any]:
-    predicted, true = (
-        _look(estimator, placements, rows, words).start,
-        placements.start[rows, target],
-    )
+    predicted = _look(estimator, placements, rows, words).start
+    true = placements.start[rows, target]
     off = predicted - true
     away = 1e3 * off[:, :2].norm(dim=1)
     errors = {
