@@ -92,8 +92,8 @@ class WeightsFormat:
         try:
             fields = dict(self.read_json(directory)["config"])
             kind = kinds if isinstance(kinds, type) else kinds[fields.pop("kind")]
-            inside = TypeAdapter(GenericAlias(tuple, (kind,)), config=_EXACT)
-            return inside.validate_python([fields])[0]
+            one: Any = GenericAlias(tuple, (kind,))  # a dataclass alone takes no config
+            return TypeAdapter(one, config=_EXACT).validate_python([fields])[0]
         except (KeyError, TypeError, ValidationError) as error:
             wrong = first_problem(error) if isinstance(error, ValidationError) else str(error)
             raise UserError(
