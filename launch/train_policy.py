@@ -26,7 +26,7 @@ from touchgoal.runtime.option_types import (
     Positive,
     checked_dataclass,
 )
-from touchgoal.sim_envs.config import ENVS, TASKS, BeadMazeConfig, TaskConfig, TaskName
+from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, TaskConfig, TaskName
 
 if TYPE_CHECKING:
     import numpy as np
@@ -321,6 +321,7 @@ def _image_input(config: Config, episodes: "EpisodeSet") -> "ImageInputConfig | 
 
 def _env(options: TrialOptions, task: TaskName, sensor: str) -> TaskConfig:
     from touchgoal.control.tactile.sensor_models import find_sensor
+    from touchgoal.sim_envs.config import ENVS
 
     env, given = ENVS[task], {name: value for name, value in vars(options).items() if value}
     if "start_angle" in given and not isinstance(env, BeadMazeConfig):
