@@ -60,12 +60,7 @@ def main(config: Config) -> None:
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
     from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.open_source import open_successes
-    from touchgoal.rewards.success import (
-        SUCCESS,
-        check_demonstrations,
-        fit_success,
-        last_costs,
-    )
+    from touchgoal.rewards.success import SUCCESS, check_demonstrations, fit_success, last_costs
     from touchgoal.rewards.value import LEAST_EPISODES, fit_value
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.progress import track
