@@ -58,6 +58,7 @@ def main(config: Config) -> None:
     from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.features.embedding_cache import embed_trajectory
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
+    from touchgoal.rewards.goals import Modality
     from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.open_source import open_successes
     from touchgoal.rewards.success import SUCCESS, check_demonstrations, fit_success, last_costs
