@@ -44,8 +44,13 @@ BENCHMARKS = {
     "grasp-search": ("papers.grasp_search", "grasps found by trial on the cost"),
     "tacbench": ("papers.tacbench.benchmark", "force, slip, pose, grasp, cloth from frozen touch"),
     "real-touch": ("real_touch.videos", "encoders on labelled videos of real touch"),
+    "real-words": ("real_touch.words", "hardness, roughness and bumpiness named by sentences"),
     "real-force": ("real_touch.forces", "force and contact on real grasps with a load cell"),
     "real-markers": ("real_touch.markers", "gel dots of real images against another tracker"),
+    "touch-spectrum": (
+        "real_touch.touch_spectrum",
+        "sharpness of simulated touch beside real sensors",
+    ),
     "tactile-realism": ("real_touch.tactile_realism", "simulated against real presses of a ball"),
     "deploy": ("deployment.deploy", "success through the environment, in process and on the wire"),
     "faults": ("deployment.faults", "what a deployment does under every fault"),

@@ -94,6 +94,12 @@ def encoder_speed(metrics: Metrics) -> str:
     return f"{row['encoder']} {rates}"
 
 
+def spectrum(metrics: Metrics) -> str:
+    """The band in which simulated touches are farthest from held-out real ones, by sensor."""
+    off = {r["sensor"]: r["simulated_db"] for r in metrics["rows"] if r["touches"].endswith("out")}
+    return "; ".join(f"{sensor} {max(decibel, key=abs):+.1f} dB" for sensor, decibel in off.items())
+
+
 def realism(metrics: Metrics) -> str:
     """Median PSNR, beside Taxim's table."""
 
@@ -109,9 +115,14 @@ def realism(metrics: Metrics) -> str:
 
 
 def real_force(metrics: Metrics) -> str:
-    """Median force error with its interval."""
+    """Median force error with its interval, largest bias of an object, correlation by force goal."""
     low, high = metrics["median_error_interval"]
-    return f"{metrics['median_error']:.2f} N [{low:.2f}, {high:.2f}]"
+    bias = max(map(abs, metrics["bias"].values()))
+    followed = [f"{row['force']:.2f}" for row in metrics["followed"]["gelsight_mini"].values()]
+    return (
+        f"{metrics['median_error']:.2f} N [{low:.2f}, {high:.2f}]; largest bias {bias:.1f} N; "
+        f"cost follows force {', '.join(followed)}"
+    )
 
 
 def markers(metrics: Metrics) -> str:
@@ -170,6 +181,13 @@ def materials(metrics: Metrics) -> str:
     """Share of real objects whose material is found by its sentences, first encoder."""
     row = metrics["rows"][0]
     return "{:.0%} [{:.0%}, {:.0%}]".format(row["accuracy"], *row["interval"])
+
+
+def properties(metrics: Metrics) -> str:
+    """Share of real videos with the right rank, by property, beside the most frequent answer."""
+    row, frequent = metrics["rows"][-1], [*metrics["most_frequent"], 0.0]
+    named = zip(row["right"].items(), frequent, strict=True)
+    return "; ".join(f"{k} {v:.2f}" + (f" ({most:.2f})" if most else "") for (k, v), most in named)
 
 
 def faults(metrics: Metrics) -> str:

@@ -24,6 +24,7 @@ key("ArrowUp"); show(61); key("ArrowLeft");  // at 3 s
 
 
 def save(name: str, image: Image.Image, curves: list[str]) -> None:
+    """Write an image of the docs with its curves in its metadata."""
     about = PngInfo()
     about.add_text("curves", json.dumps(curve_colors(curves)))
     image.save(Path(__file__).parent / f"{name}.png", pnginfo=about, optimize=True)

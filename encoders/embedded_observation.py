@@ -18,7 +18,7 @@ TOUCH = "observation.touch"
 Observation = dict[str, Any]
 
 
-class EmbeddedTouch(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
+class EmbeddedTouch(gym.ObservationWrapper[Observation, np.ndarray, Observation]):
     """Replaces the tactile images by `observation.touch`: the left embedding, then the right one.
 
     An episode's first images, which are untouched, are the background.
@@ -44,17 +44,13 @@ class EmbeddedTouch(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode; its first images must be free of contact."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._untouched = {key: observation[key] for key in TACTILE}
         self._ticks.clear()
-        return self._embedded(observation), info
+        return super().reset(seed=seed, options=options)
 
-    def step(self, action: np.ndarray) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
-        """Run one step."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._embedded(observation), reward, terminated, truncated, info
-
-    def _embedded(self, observation: Observation) -> Observation:
+    def observation(self, observation: Observation) -> Observation:
+        """Return an observation with its touch embedded."""
+        if not self._ticks:
+            self._untouched = {key: observation[key] for key in TACTILE}
         self._ticks.append(observation)
         kept = {key: value for key, value in observation.items() if key not in TACTILE}
         return kept | {TOUCH: self._embed()}

@@ -9,7 +9,6 @@ import torch
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
-from touchgoal.encoders.backbones.vit import ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.published import find_published, load_published
 from touchgoal.encoders.training.weights import WeightsFormat
@@ -111,7 +110,7 @@ def load_encoder(name_or_path: str | Path, sensor: str | None = None) -> AnyTouc
     path = find_encoder(name_or_path)
     if not path.is_dir():
         return load_published(path)
-    config = ENCODER_FORMAT.read_config(path, _build_config)
+    config = ENCODER_FORMAT.read_config(path, _CONFIGS)
     _check_sensor(config, path, sensor)
     encoder: AnyTouchEncoder
     match config:
@@ -133,15 +132,6 @@ def load_pooled_encoder(name_or_path: str | Path) -> PooledEncoder:
             f"{name_or_path} was not trained by `train-encoder surfaces`: give one that was"
         )
     return encoder
-
-
-def _build_config(
-    fields: dict[str, Any],
-) -> TouchEncoderConfig | TouchBackboneConfig | PooledEncoderConfig:
-    kind = fields.pop("kind")
-    if vit := fields.get("vit"):
-        fields["vit"] = ViTConfig(**{**vit, "image_size": tuple(vit["image_size"])})
-    return _CONFIGS[kind](**fields)
 
 
 def _check_sensor(

@@ -213,7 +213,7 @@ def collect(
     metas, failures = [], Counter[str]()
     # the writer refuses a second recorder at once
     with closing(EpisodeWriter(root, fps=config.control_hz)) as writer:
-        check_fits(writer, config)
+        _check_fits(writer, root, config)
         with (
             parallel_map(partial(record_encoded, config, roles), specs, workers) as recorded,
             progress_bar("recording", len(specs), "episode") as bar,
@@ -230,14 +230,14 @@ def collect(
     return metas
 
 
-def check_fits(writer: EpisodeWriter, config: TaskConfig) -> None:
+def _check_fits(writer: EpisodeWriter, root: Path, config: TaskConfig) -> None:
     """Raise UserError if a task's episodes would not fit the set that the writer continues."""
-    if len(writer):
+    if writer.metadata:
         env = make_env(config)
         assert isinstance(env.observation_space, gym.spaces.Dict)
         spaces = {**env.observation_space.spaces, ft.ACTION: env.action_space}
         shapes = {key: space.shape or () for key, space in spaces.items()}
-        writer.check_fits(shapes, env.task)
+        writer.metadata.check_fits(root, shapes, env.task)
         env.close()
 
 

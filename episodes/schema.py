@@ -6,15 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.control.features import (
-    ACTION,
-    FEATURES,
-    IMAGE_PREFIX,
-    N_JOINTS,
-    STATE,
-    Feature,
-    features_of,
-)
+from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
 
 MetaValue = str | int | float | bool | list[str]
@@ -30,7 +22,7 @@ INDEX_DTYPES = {  # which LeRobot adds to every frame, each a scalar of feature 
 
 def is_image(key: str) -> bool:
     """Return whether a key holds images, of a camera or of a fingertip sensor."""
-    return key.startswith(IMAGE_PREFIX)
+    return key.startswith(ft.IMAGE_PREFIX)
 
 
 def is_camera(key: str) -> bool:
@@ -58,12 +50,12 @@ class Episode:
         return next((len(values) for values in self.frames.values()), 0)
 
     @property
-    def features(self) -> dict[str, Feature]:
+    def features(self) -> dict[str, ft.Feature]:
         """`FEATURES` for this episode's arm; the length of its state, else its action, gives the joints."""
-        for key, joints in ((STATE, lambda n: (n - 1) // 2), (ACTION, lambda n: n - 1)):
+        for key, joints in ((ft.STATE, lambda n: (n - 1) // 2), (ft.ACTION, lambda n: n - 1)):
             if key in self.frames and self.frames[key].ndim == 2:
-                return features_of(joints(self.frames[key].shape[1]))
-        return features_of(N_JOINTS)
+                return ft.features_of(joints(self.frames[key].shape[1]))
+        return ft.features_of(ft.N_JOINTS)
 
     def check(self) -> None:
         """Raise UserError, naming the key, if a value cannot be stored without loss."""
@@ -84,9 +76,9 @@ class Episode:
             _check_meta(key, value)
 
 
-def _check_key(features: dict[str, Feature], key: str, values: np.ndarray) -> None:
+def _check_key(features: dict[str, ft.Feature], key: str, values: np.ndarray) -> None:
     if key not in features:
-        raise UserError(f"{key!r} is no key of touchgoal; known keys: {', '.join(FEATURES)}")
+        raise UserError(f"{key!r} is no key of touchgoal; known keys: {', '.join(ft.FEATURES)}")
     feature = features[key]
     if values.dtype != feature.dtype:
         raise UserError(f"{key} has dtype {values.dtype}: convert it to {feature.dtype}")
@@ -149,9 +141,3 @@ def _video_info(shape: list[int], fps: int) -> dict[str, Any]:
         "is_depth_map": False,
         "has_audio": False,
     }
-
-
-def drop_pixel_format(features: dict[str, dict[str, Any]]) -> None:
-    """Remove `video.pix_fmt`, which sets of older versions name and lerobot's own tools reject."""
-    for feature in features.values():
-        (feature.get("info") or {}).pop("video.pix_fmt", None)

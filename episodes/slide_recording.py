@@ -12,13 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from touchgoal.control.features import (
-    TACTILE_LEFT,
-    TRUTH_CONTACT,
-    TRUTH_OBJECT_POSE,
-    TRUTH_PAD_WRENCH,
-    TRUTH_SLIP,
-)
+from touchgoal.control import features as ft
 from touchgoal.episodes.format.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
@@ -79,7 +73,7 @@ def slide_episode(slide: Slide) -> Recorded:
     half, zero = slide.pose[:, 2] / 2, np.zeros(len(slide.pose), np.float32)
     turned = np.column_stack([np.cos(half), zero, zero, np.sin(half)])
     frames = left_fingertip(slide.frames, slide.wrench, slide.slip)
-    frames[TRUTH_OBJECT_POSE] = np.column_stack([slide.pose[:, :2], zero, turned]).astype("f4")
+    frames[ft.TRUTH_OBJECT_POSE] = np.column_stack([slide.pose[:, :2], zero, turned]).astype("f4")
     task = f"slide and turn a {slide.held} on the sensor"
     return frames, task, {"object": slide.held, "load": slide.load}
 
@@ -93,8 +87,8 @@ def left_fingertip(
     n = len(images)
     nothing = np.zeros(n, bool)
     return {
-        TACTILE_LEFT: images,
-        TRUTH_PAD_WRENCH: np.hstack([wrench, np.zeros((n, 6), np.float32)]),
-        TRUTH_CONTACT: np.column_stack([wrench[:, 2] < 0, nothing]),
-        TRUTH_SLIP: np.column_stack([slip, nothing]),
+        ft.TACTILE_LEFT: images,
+        ft.TRUTH_PAD_WRENCH: np.hstack([wrench, np.zeros((n, 6), np.float32)]),
+        ft.TRUTH_CONTACT: np.column_stack([wrench[:, 2] < 0, nothing]),
+        ft.TRUTH_SLIP: np.column_stack([slip, nothing]),
     }

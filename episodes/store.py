@@ -30,12 +30,7 @@ from touchgoal.episodes.format.episode_table import EpisodePlace
 from touchgoal.episodes.format.foreign import foreign_file, refusal
 from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.episodes.format.repair import unlisted_files
-from touchgoal.episodes.keys import (
-    guess_keys,
-    note_guess,
-    readable_features,
-    stored_names,
-)
+from touchgoal.episodes.keys import guess_keys, note_guess, readable_features, stored_names
 from touchgoal.episodes.media import decode_video, video_checksum, video_length
 from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue
 from touchgoal.runtime.atomic_write import write_file
@@ -48,6 +43,7 @@ class EpisodeWriter:
 
     The first episode fixes the features, image sizes and meta keys of a new set. A second writer, in
     this process or another one, is refused until this one is closed or garbage, or its process ends.
+    `metadata` is the set's; None before the first episode.
     """
 
     def __init__(self, root: str | os.PathLike[str], fps: int = 20) -> None:
@@ -66,7 +62,7 @@ class EpisodeWriter:
         self._fps = fps
         self._lock = FolderLock(self._root)
         try:
-            self._metadata = self._load()
+            self.metadata = self._load()
         except BaseException:
             self._lock.release()
             raise
@@ -98,21 +94,11 @@ class EpisodeWriter:
         return found
 
     def __len__(self) -> int:
-        return 0 if self._metadata is None else self._metadata.n_episodes
+        return 0 if self.metadata is None else self.metadata.n_episodes
 
     def close(self) -> None:
         """Release the set for another writer."""
         self._lock.release()
-
-    def check_fits(self, shapes: Mapping[str, tuple[int, ...]], task: str) -> None:
-        """Raise UserError, before any work, if episodes to come would not fit an existing set.
-
-        Args:
-            shapes: Shape of every observation and of the action at one frame.
-            task: Name of the task, as in the meta of episodes.
-        """
-        if self._metadata is not None:
-            self._metadata.check_fits(self._root, shapes, task)
 
     def append(self, episode: Episode | EncodedEpisode) -> int:
         """Add an episode and return its index in the set; it is on disk by then.
@@ -124,7 +110,7 @@ class EpisodeWriter:
         whole = isinstance(episode, Episode)
         encoded = encode(episode, self._fps, self._root) if whole else episode
         description = encoded.description
-        current = self._metadata or SetMetadata(self._fps, description.features)
+        current = self.metadata or SetMetadata(self._fps, description.features)
         file_number = current.next_file_number
         updated = current.with_episode(description, file_number)
         if (path := self._root / set_files.data_path(file_number)).exists():
@@ -136,7 +122,7 @@ class EpisodeWriter:
             write_file(self._root / set_files.video_path(key, file_number), video)
         write_data_file(path, encoded, current.index_columns_for(description))
         updated.write(self._root, first_file=len(updated.files) - 1)
-        self._metadata = updated
+        self.metadata = updated
         return len(self) - 1
 
 

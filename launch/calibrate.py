@@ -46,15 +46,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Fit without the held-out presses and measure errors on them, then fit all."""
-    from touchgoal.control.calibration import report
-    from touchgoal.control.calibration.calibrate import (
-        ILLUMINATION_EXPONENTS,
-        SQUARES_MINIMUM,
-        STEPS,
-        depth_errors,
-        fit,
-        select_illumination_exponent,
-    )
+    from touchgoal.control.calibration import calibrate, report
     from touchgoal.control.calibration.press_set import read_presses, split
     from touchgoal.control.calibration.report import light_compass
     from touchgoal.control.tactile.image_guard import check_presses, check_untouched
@@ -70,9 +62,9 @@ def main(config: Config) -> None:
     model = find_model(config.sensor)
     pitch = config.mm_per_pixel * 1e-3
     presses = read_presses(config.presses, pitch, config.ball_mm or math.nan)
-    if config.squares and len(presses) < SQUARES_MINIMUM:
+    if config.squares and len(presses) < calibrate.SQUARES_MINIMUM:
         raise UserError(
-            f"--squares needs {SQUARES_MINIMUM} presses, {config.presses} has {len(presses)}: add "
+            f"--squares needs {calibrate.SQUARES_MINIMUM} presses, {config.presses} has {len(presses)}: add "
             "presses, or leave the option out"
         )
     if config.check_lamps:
@@ -83,14 +75,14 @@ def main(config: Config) -> None:
     train, test = split(presses, round(config.held_out * len(presses)), config.seed)
     power = config.illumination_exponent
     if power is None:
-        fits = len(ILLUMINATION_EXPONENTS)
+        fits = len(calibrate.ILLUMINATION_EXPONENTS)
         with progress_bar("finding how the light varies", fits, "fit") as bar:
-            power = select_illumination_exponent(
+            power = calibrate.select_illumination_exponent(
                 train, pitch, config.sensor, bar.update, config.squares
             )
-    with progress_bar("fitting", 2 * STEPS, "step") as bar:
+    with progress_bar("fitting", 2 * calibrate.STEPS, "step") as bar:
         judged, fitted = (
-            fit(
+            calibrate.fit(
                 each,
                 pitch,
                 config.sensor,
@@ -103,7 +95,7 @@ def main(config: Config) -> None:
     errors = report.held_out_errors(judged, test)
     print(report.errors_table(errors, len(test)))
     report.require_better_than_background(errors)
-    depth = depth_errors(judged.calibration, test, judged.fit_circles(test))
+    depth = calibrate.depth_errors(judged.calibration, test, judged.fit_circles(test))
     depths = report.median_by_ball(depth, test.ball_radius)
     print(report.depth_table(depths))
     for line in report.warnings(fitted, presses):

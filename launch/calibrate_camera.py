@@ -16,6 +16,7 @@ import tyro
 from pydantic import Field
 
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.option_types import Positive, checked_dataclass
 
 if TYPE_CHECKING:
@@ -24,8 +25,7 @@ if TYPE_CHECKING:
     from touchgoal.control.cell.config import CellConfig
     from touchgoal.control.cell.connection import CellConnection
     from touchgoal.control.hand_eye.board import Board
-    from touchgoal.control.hand_eye.record import View
-    from touchgoal.control.hand_eye.solve import HandEye
+    from touchgoal.control.hand_eye.solve import HandEye, View
 
 Side = Annotated[int, Field(ge=3, le=10)]
 
@@ -70,7 +70,7 @@ def main(config: Config) -> None:
 def _calibrate(config: Config, path: Path, board: "Board") -> None:
     from touchgoal.control.cell.cell_file import read_cell_file
     from touchgoal.control.deployment.preflight import check_client
-    from touchgoal.control.hand_eye.record import calibrate_camera
+    from touchgoal.control.hand_eye.solve import calibrate_camera
     from touchgoal.launch.support.cell_run import connect
     from touchgoal.launch.support.confirm import confirm
     from touchgoal.runtime.run_folder import open_run
@@ -95,7 +95,7 @@ def _views(
 ) -> "Iterator[View]":
     """Yield the views that show the board, and say of each how much of it."""
     from touchgoal.control import features as ft
-    from touchgoal.control.hand_eye.record import take_view
+    from touchgoal.control.hand_eye.solve import take_view
 
     count = 0
     places = _by_hand() if config.poses is None else _moved(config.poses, cell, connection)
@@ -152,7 +152,6 @@ def _read_poses(path: Path, n_joints: int) -> list[Any]:
 
 def _save_views(views: "list[View]", out: Path) -> None:
     from touchgoal.runtime.image_file import write_image
-    from touchgoal.runtime.json_file import write_json
 
     for i, view in enumerate(views):
         write_image(out / f"view_{i:02d}.png", view.image)
@@ -164,7 +163,6 @@ def _report(result: "HandEye", config: Config, cell_file: Path, out: Path, rows:
 
     from touchgoal.control.cell.camera_pose import camera_lines, write_camera
     from touchgoal.control.deployment.observation import quaternion
-    from touchgoal.runtime.json_file import write_json
 
     mm, degrees = 1e3 * result.position_errors, np.degrees(result.rotation_errors)
     closed = result.closed_form[:3, 3] - result.pose[:3, 3]

@@ -55,13 +55,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Record the episodes and print how many of each outcome there are."""
-    from touchgoal.episodes.recording import (
-        NoSuccessError,
-        collect,
-        episode_specs,
-        expert_alone,
-        missing_specs,
-    )
+    from touchgoal.episodes import recording
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.policies.evaluation.success_rate import SuccessRate
     from touchgoal.policies.training.dagger import dagger_roles
@@ -70,16 +64,16 @@ def main(config: Config) -> None:
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.run_folder import open_run
 
-    roles, acts = expert_alone, config.policy not in (None, "expert")
+    roles, acts = recording.expert_alone, config.policy not in (None, "expert")
     if config.feedback or config.policy is not None:
         if config.outcomes != ("success",):
             message = "--outcomes needs the planned expert: leave out --feedback and --policy"
             raise UserError(message)
         roles = dagger_roles(config.policy, config.env, config.feedback)
-    specs = episode_specs(config.env, config.outcomes, config.episodes, config.seed)
+    specs = recording.episode_specs(config.env, config.outcomes, config.episodes, config.seed)
     out = open_run(config.out, "collect-demos", config, adds=True)
     root = out / "episodes"
-    missing = missing_specs(root, specs, corrected=acts)
+    missing = recording.missing_specs(root, specs, corrected=acts)
     if len(missing) < len(specs):
         print(f"{len(specs) - len(missing)} of {len(specs)} seeds are recorded in {root}: skipped")
     if not missing:
@@ -90,8 +84,10 @@ def main(config: Config) -> None:
     kept = f"finished episodes are in {root}; the same command with --out {out} continues"
     try:
         with on_interruption(lambda: kept):
-            metas = collect(root, config.env, missing, config.ray or config.workers, roles, most)
-    except NoSuccessError as error:
+            metas = recording.collect(
+                root, config.env, missing, config.ray or config.workers, roles, most
+            )
+    except recording.NoSuccessError as error:
         print(f"{error}; look at one: touchgoal run-policy --task {config.task}", file=sys.stderr)
         sys.exit(NO_SUCCESS)
     outcomes = Counter(str(meta["outcome"]) for meta in metas)

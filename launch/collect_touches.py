@@ -14,7 +14,9 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
+from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
+from touchgoal.runtime.run_folder import open_run
 
 _DEFAULT = {"wand": (5182, "gelsight_mini"), "slide": (300, "gelsight_mini_markers")}
 
@@ -67,9 +69,7 @@ def _simulate(config: Any) -> None:
     from touchgoal.episodes.slide_recording import record_slides
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.episodes.wand.recording import record_touches
-    from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.interruption import on_interruption
-    from touchgoal.runtime.run_folder import open_run
 
     if config.object or config.description or config.new_gel:
         raise UserError(
@@ -101,8 +101,6 @@ def _record_real(config: Any) -> None:
     from touchgoal.control.cell.config_file import read_config
     from touchgoal.control.cell.wand import WandConfig
     from touchgoal.episodes.wand.real_recording import record_real_touches
-    from touchgoal.runtime.errors import UserError
-    from touchgoal.runtime.run_folder import open_run
 
     if config.body != "wand" or config.sensor:
         raise UserError(
@@ -121,7 +119,6 @@ def _record_real(config: Any) -> None:
 
 def _described(name: str | None, descriptions: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
     """Return an object's name and sentences: the user's own, or the catalogue's."""
-    from touchgoal.runtime.errors import UserError
     from touchgoal.sim_envs.wand.objects import find_wand_object
 
     if not name:

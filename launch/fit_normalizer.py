@@ -58,14 +58,10 @@ def main(config: Config) -> None:
     from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.features.embedding_cache import embed_trajectory
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
+    from touchgoal.rewards.goals import Modality
     from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.open_source import open_successes
-    from touchgoal.rewards.success import (
-        SUCCESS,
-        check_demonstrations,
-        fit_success,
-        last_costs,
-    )
+    from touchgoal.rewards.success import SUCCESS, check_demonstrations, fit_success, last_costs
     from touchgoal.rewards.value import LEAST_EPISODES, fit_value
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.progress import track
@@ -94,7 +90,8 @@ def main(config: Config) -> None:
     ]
     calibration = embedded[len(embedded) - config.success_from :]
     embedded = embedded[: len(embedded) - config.success_from]
-    modalities = config.modalities or tuple(m for m in embedded[0].modalities if m != "text")
+    own: list[Modality] = [m for m in embedded[0].modalities if m != "text"]
+    modalities = config.modalities or own
     normalizer = fit_normalizer(embedded, modalities, inputs.scene)
     value = fit_value(embedded, inputs.fitted_task) if config.value else None
     ends = SuccessfulEnds.of(embedded)

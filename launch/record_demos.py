@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from touchgoal.control.features import CONTROL_HZ
+from touchgoal.control.features import CONTROL_HZ, FRONT
 from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import DeviceName
 from touchgoal.runtime.errors import UserError
@@ -181,8 +181,6 @@ def _open_device(config: Config, connection: "CellConnection", seed: int) -> "Te
 def _save_goal_image(result: "Result", path: Path) -> None:
     """Write the front camera's last image, if there is one: a goal for task.rewards."""
     from PIL import Image
-
-    from touchgoal.control.features import FRONT
 
     if FRONT in result.log.newest:
         Image.fromarray(result.log.newest[FRONT]).save(path)

@@ -1,9 +1,10 @@
 """Cost and reward curves of episodes, or of plain videos or folders of images, towards a goal.
 
-A goal is: last (the last frame), frame:K, image:PATH, episode:ROOT#K (the end of another episode)
-or text:SENTENCE (how the object feels). Each modality (image, touch, text) takes the first goal that
-applies to it. The cost is the distance to the goal; rewards are -cost, and its fall from frame to
-frame (Ng et al. 1999). Embeddings of a set are kept inside it: another goal takes seconds.
+A goal is: last (the last frame), frame:K, image:PATH, episode:ROOT#K (the end of another episode),
+text:SENTENCE (how the object feels) or force:N (newtons on a fingertip, 3.5 for example). Each
+modality (image, touch, text, force) takes the first goal that applies to it. The cost is the distance
+to the goal; rewards are -cost, and its fall from frame to frame (Ng et al. 1999). Embeddings of a set
+are kept inside it: another goal takes seconds.
 
 What is broken is skipped and listed in skipped.csv; the exit status is 1 only if nothing could be
 measured. The same command with the same --out continues an interrupted run.

@@ -11,12 +11,10 @@ from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.ssl import config as ssl
 from touchgoal.encoders.training.options import SetTrainerOptions
 from touchgoal.launch.support.align_options import Align, Preset, presets
-from touchgoal.runtime.option_types import (
-    RARE,
-    Count,
-    Seed,
-    checked_dataclass,
-)
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import RARE, Count, Seed, checked_dataclass
+from touchgoal.runtime.provenance import provenance
+from touchgoal.runtime.run_folder import open_run
 
 _GRASP_FRAMES = 24  # frames with contact taken from each episode of a grasp, both fingertips
 
@@ -142,7 +140,8 @@ class Adapt:
 
     data: Path
     """Folder with videos/ and labels.csv in PhysiCLeAR's layout; its splits train and unlabelled are
-    used. Where labels.csv ranks hardness, roughness and bumpiness, the encoder also learns sentences."""
+    used. Where labels.csv ranks hardness, roughness and bumpiness, sentences fitted to the ranks replace
+    the encoder's."""
     encoder: str = "gelsight_mini"
     """Encoder to adapt: a name, or its folder."""
     towers: str = "offline"
@@ -206,18 +205,14 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
 
 
 def _fit_to_surfaces(config: Surfaces) -> None:
-    from touchgoal.control.tactile.sensor_calibration import load
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.encoders.pretrained import save
     from touchgoal.encoders.whitening.simulated_surfaces import WhiteningConfig, train
-    from touchgoal.runtime.provenance import provenance
-    from touchgoal.runtime.run_folder import open_run
 
     sensor = find_sensor(config.sensor)
-    name = load(sensor.sensor_file).sensor
     out = open_run(config.out, "train-encoder", config)
     whitening = WhiteningConfig(config.surfaces, config.presses_per_surface, config.seed)
-    encoder = train(sensor, name, whitening)
+    encoder = train(sensor, whitening)
     source = {
         "data": "simulated: random surfaces pressed",
         "simulated_sensor": config.sensor,
@@ -230,23 +225,15 @@ def _fit_to_surfaces(config: Surfaces) -> None:
 
 def _add_words(config: Words) -> None:
     from touchgoal.control.tactile.sensor_models import find_sensor
+    from touchgoal.encoders import pretrained
     from touchgoal.encoders.alignment.described_touches import embed_grasps, pair
     from touchgoal.encoders.alignment.green_screen import background_changer
     from touchgoal.encoders.alignment.heads import fit_heads
     from touchgoal.encoders.alignment.wand_set import WandSet, is_wand_set
     from touchgoal.encoders.alignment.words import embed_surfaces, embed_wand, with_heads
-    from touchgoal.encoders.pretrained import (
-        ENCODER_FORMAT,
-        find_encoder,
-        load_pooled_encoder,
-        save,
-    )
     from touchgoal.encoders.towers.towers import load_towers
-    from touchgoal.runtime.errors import UserError
-    from touchgoal.runtime.provenance import provenance
-    from touchgoal.runtime.run_folder import open_run
 
-    encoder = load_pooled_encoder(config.encoder)
+    encoder = pretrained.load_pooled_encoder(config.encoder)
     of_wand = [root for root in config.data if is_wand_set(root)]
     if not of_wand:
         raise UserError("no set has views: record one with collect-touches --body wand")
@@ -272,9 +259,10 @@ def _add_words(config: Words) -> None:
         "heads": asdict(config.heads),
         "seed": config.seed,
     }
-    before = ENCODER_FORMAT.provenance(find_encoder(config.encoder, published=False))
+    folder = pretrained.find_encoder(config.encoder, published=False)
+    before = pretrained.ENCODER_FORMAT.provenance(folder)
     worded = with_heads(encoder, towers, heads)
-    save(worded, out / "encoder", {"words_added_to": before, **source, **provenance()})
+    pretrained.save(worded, out / "encoder", {"words_added_to": before, **source, **provenance()})
     print(f"encoder: {out / 'encoder'}")
 
 
@@ -284,8 +272,6 @@ def _adapt(config: Adapt) -> None:
     from touchgoal.encoders.towers.towers import load_towers
     from touchgoal.encoders.whitening.adapt import adapt
     from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
-    from touchgoal.runtime.provenance import provenance
-    from touchgoal.runtime.run_folder import open_run
 
     encoder = load_pooled_encoder(config.encoder)
     every = read_labelled_videos(config.data)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, cast
 
+from touchgoal.control import features as ft
 from touchgoal.encoders.training.options import TrainingOptions
 from touchgoal.policies.config import (
     ActionRepresentation,
@@ -14,7 +15,8 @@ from touchgoal.policies.config import (
     TouchInput,
     TrainConfig,
 )
-from touchgoal.policies.training.action_meaning import ActionMeaning
+from touchgoal.policies.training.action_meaning import ActionMeaning, check_actions
+from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import (
     RARE,
     Count,
@@ -177,16 +179,9 @@ def main(config: Config) -> None:
     from touchgoal.policies.checkpoint import ESTIMATOR, TOUCH
     from touchgoal.policies.perception.frozen_touch import load_touch
     from touchgoal.policies.perception.state_estimation import load_pose_estimator
-    from touchgoal.policies.training import training_data
-    from touchgoal.policies.training.action_meaning import check_actions
+    from touchgoal.policies.training import sequence_dataset, training_data
     from touchgoal.policies.training.model_selection import copy_parts, score, select
-    from touchgoal.policies.training.sequence_dataset import (
-        SequenceDataset,
-        check_arm,
-        load_recordings,
-    )
     from touchgoal.policies.training.train import POLICY, train
-    from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.json_file import write_json
 
     check_run(config, config.out)
@@ -216,7 +211,7 @@ def main(config: Config) -> None:
     env = _env(config.env, simulated, sensor) if simulated else None
     policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
     for one in sets:
-        check_arm(one)
+        sequence_dataset.check_arm(one)
     meant = [check_actions(*one, config.actions) for one in chosen]
     pauses = [training_data.find_pauses(*one, config.actions) for one in chosen]
     out = open_training(config, "train-policy")
@@ -228,12 +223,13 @@ def main(config: Config) -> None:
     skipped = pauses if config.trim_pauses else [None, None]
     workers = config.ray or config.workers
     recordings = (
-        load_recordings(s, r, policy, touch, workers, skip, config.actions)
+        sequence_dataset.load_recordings(s, r, policy, touch, workers, skip, config.actions)
         for (s, r), skip in zip(chosen, skipped, strict=True)
     )
     first, other = recordings
     weights = _weights(config, sets[0], rows[0], skipped[0]) if config.progress else None
-    windows, validation = SequenceDataset(first, policy, weights), SequenceDataset(other, policy)
+    windows = sequence_dataset.SequenceDataset(first, policy, weights)
+    validation = sequence_dataset.SequenceDataset(other, policy)
     print(f"{len(windows)} windows of {len(rows[0])} episodes; {len(validation)} for validation")
     provenance = recipe(*sets) | {"episodes": len(rows[0])}
     warmup = _WARMUP_STEPS[config.preset]
@@ -254,7 +250,6 @@ def main(config: Config) -> None:
 def _policy_config(
     config: Config, episodes: "EpisodeSet", touch: "TouchEmbedder | None"
 ) -> "PolicyConfig":
-    from touchgoal.control import features as ft
     from touchgoal.policies.heads.diffusion import DiffusionConfig
     from touchgoal.policies.heads.mlp import MLPConfig
     from touchgoal.policies.heads.unet import PRESETS
@@ -304,9 +299,7 @@ def _weights(
 
 
 def _image_input(config: Config, episodes: "EpisodeSet") -> "ImageInputConfig | None":
-    from touchgoal.control import features as ft
     from touchgoal.policies.sight.frozen_images import ImageInputConfig
-    from touchgoal.runtime.errors import UserError
 
     if not config.cameras:
         return None
@@ -328,7 +321,6 @@ def _image_input(config: Config, episodes: "EpisodeSet") -> "ImageInputConfig | 
 
 def _env(options: TrialOptions, task: TaskName, sensor: str) -> TaskConfig:
     from touchgoal.control.tactile.sensor_models import find_sensor
-    from touchgoal.runtime.errors import UserError
     from touchgoal.sim_envs.config import ENVS
 
     env, given = ENVS[task], {name: value for name, value in vars(options).items() if value}

@@ -39,14 +39,9 @@ def main(config: Config) -> None:
 
     from touchgoal.encoders.training.run import check_run, open_training
     from touchgoal.encoders.training.trainer import is_first_process
+    from touchgoal.policies.perception import pose_training
     from touchgoal.policies.perception.placements import Variety, render_placements
     from touchgoal.policies.perception.pose_estimator import PoseEstimator
-    from touchgoal.policies.perception.pose_training import (
-        error_table,
-        fit_sure,
-        pose_errors,
-        train_pose_estimator,
-    )
     from touchgoal.policies.perception.state_estimation import ESTIMATOR_FORMAT
     from touchgoal.runtime import seeds
     from touchgoal.runtime.json_file import write_json
@@ -64,13 +59,13 @@ def main(config: Config) -> None:
         front_camera=config.front_camera,
     )
     rendered = render_placements(env, config.scenes, config.placements, first_seed, config.workers)
-    train_pose_estimator(network, rendered, config.train, out, config, known)
+    pose_training.train_pose_estimator(network, rendered, config.train, out, config, known)
     if not is_first_process():
         return
     few = max(1, config.scenes // 8)
     first = seeds.POSE_VALIDATION.start
     usual = render_placements(env, few, 10, first + few, config.workers, Variety(0, 0.5, 0, 0))
-    sure, refused = fit_sure(network, usual)
+    sure, refused = pose_training.fit_sure(network, usual)
     network.config = replace(network.config, sure=sure)
     print(f"refused: {refused['good']:.1%} of good estimates, {refused['bad']:.0%} of bad ones")
     errors = {}
@@ -80,8 +75,8 @@ def main(config: Config) -> None:
         ("hand over an object", Variety(0, 0, 0, 1)),
     ):
         others = render_placements(env, few, 10, first, config.workers, variety)
-        errors[where] = pose_errors(network, others)
-        print(f"{where}\n{error_table(errors[where])}")
+        errors[where] = pose_training.pose_errors(network, others)
+        print(f"{where}\n{pose_training.error_table(errors[where])}")
     known |= {"scenes": config.scenes, "errors": errors, "refused": refused}
     ESTIMATOR_FORMAT.save_half(network, out / "estimator", network.config, known)
     write_json(out / "metrics.json", errors)

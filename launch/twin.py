@@ -17,12 +17,7 @@ from pydantic import Field
 from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Seed, checked_dataclass
-from touchgoal.sim_envs.config import (
-    STREAM_SIZE,
-    BeadMazeConfig,
-    PickPlaceConfig,
-    TaskConfig,
-)
+from touchgoal.sim_envs.config import STREAM_SIZE, BeadMazeConfig, PickPlaceConfig, TaskConfig
 
 if TYPE_CHECKING:
     from touchgoal.control.cell.config import CellConfig

@@ -145,19 +145,16 @@ class LearnedPolicy(Planner):
             self._refuse_novel(batch)
             rest = self._generator, self._width, self._key_pose
             actions = self._network.plan(batch, *rest)[0].numpy()
-            actions[:, :-1] *= self._speed(history[-1])
+            # The last action of a plan comes a tick and `execution_horizon` ticks after its
+            # observation. The whole motion is done where no age is known.
+            reaction = (1 + self.execution_horizon) / self.control_hz
+            age = history[-1].get(ft.AGE, np.zeros(1)).item()
+            actions[:, :-1] *= speed_for_age(age, reaction)
             width = float(actions[self.execution_horizon - 1, -1])
             if self._width not in (None, width):
                 self._key_pose.change_gripper()
             self._width = width
             return actions
-
-    def _speed(self, observation: Observation) -> float:
-        """Return the share of the planned motion to do; all of it where no age is known."""
-        age = observation.get(ft.AGE, np.zeros(1)).item()
-        # The last action of a plan comes a tick and `execution_horizon` ticks after its observation.
-        reaction = (1 + self.execution_horizon) / self.control_hz
-        return speed_for_age(age, reaction)
 
     def _refuse_novel(self, batch: ObservationBatch) -> None:
         """Raise RefusedError once touch has been unlike the training for a second of plans."""

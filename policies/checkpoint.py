@@ -9,16 +9,11 @@ import torch
 
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.acting import LearnedPolicy
-from touchgoal.policies.config import POLICIES, SamplerConfig
-from touchgoal.policies.heads.diffusion import DiffusionConfig
-from touchgoal.policies.heads.mlp import MLPConfig
-from touchgoal.policies.heads.unet import UNetConfig
+from touchgoal.policies.config import POLICIES
 from touchgoal.policies.network import PolicyConfig, PolicyNetwork
-from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_pose_estimator
-from touchgoal.policies.sight.frozen_images import ImageInputConfig
 from touchgoal.runtime.errors import UserError, unknown_name
 
 TOUCH, ESTIMATOR = "touch", "estimator"  # folders beside a policy's weights
@@ -47,7 +42,7 @@ def save(policy: PolicyNetwork, directory: Path, provenance: dict[str, Any]) -> 
 def load(directory: Path) -> PolicyNetwork:
     """Read a network for inference on the CPU; UserError if there is none or it is damaged."""
     with torch.random.fork_rng(devices=[]):  # its initialisation draws from the global generator
-        network = PolicyNetwork(POLICY_FORMAT.read_config(directory, _config))
+        network = PolicyNetwork(POLICY_FORMAT.read_config(directory, PolicyConfig))
     POLICY_FORMAT.load_weights(network, directory)
     return network
 
@@ -151,11 +146,8 @@ def find_policy(name_or_path: str | Path, task: str = "") -> Path:
         if task not in SHIPPED_POLICIES:
             raise UserError(f"no policy ships for {task}: train one, or take the expert")
         return SHIPPED_POLICIES[task]
-    for folder in (
-        folders.get(name),
-        Path(name),
-        Path(name) / "policy",
-    ):  # train-policy's --out, too
+    # train-policy's --out holds the folder `policy`
+    for folder in (folders.get(name), Path(name), Path(name) / "policy"):
         if folder and POLICY_FORMAT.weights_path(folder).is_file():
             return folder
     if Path(name).is_dir():
@@ -166,26 +158,3 @@ def find_policy(name_or_path: str | Path, task: str = "") -> Path:
         f"{unknown_name('policy', name, names)}, or name a folder that train-policy or pull made"
         f"{others if task else ''}"
     )
-
-
-def _config(fields: dict[str, Any]) -> PolicyConfig:
-    head = fields["head"]
-    if "denoiser" in head:
-        denoiser = _denoiser(head["denoiser"])
-        fields["head"] = DiffusionConfig(denoiser, SamplerConfig(**head["sampler"]))
-    else:
-        fields["head"] = MLPConfig(**head)
-    if end_to_end := fields["end_to_end"]:
-        fields["end_to_end"] = EndToEndConfig(**end_to_end | {"size": tuple(end_to_end["size"])})
-    if images := fields.get("images"):
-        pairs = {name: tuple(images[name]) for name in ("cameras", "size")}
-        fields["images"] = ImageInputConfig(**images | pairs)
-    for key in ("proprioception", "gripper_widths"):
-        fields[key] = tuple(fields[key])
-    return PolicyConfig(**fields)
-
-
-def _denoiser(fields: dict[str, Any]) -> UNetConfig | MLPConfig:
-    if "channels" in fields:
-        return UNetConfig(**{**fields, "channels": tuple(fields["channels"])})
-    return MLPConfig(**fields)

@@ -6,12 +6,7 @@ from pydantic import Field
 
 from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.option_types import (
-    FIXED,
-    Count,
-    Positive,
-    checked_dataclass,
-)
+from touchgoal.runtime.option_types import FIXED, Count, Positive, checked_dataclass
 
 Head = Literal["small", "published", "tiny", "mlp", "regression"]
 """A diffusion head with a U-Net of that size or a multilayer perceptron, or one that predicts a plan

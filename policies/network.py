@@ -19,11 +19,7 @@ from touchgoal.policies.actions import (
     to_representation,
 )
 from touchgoal.policies.config import ActionRepresentation, TouchInput
-from touchgoal.policies.heads.diffusion import (
-    Diffusion,
-    DiffusionConfig,
-    Regression,
-)
+from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig, Regression
 from touchgoal.policies.heads.mlp import MLPConfig, readout
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
@@ -198,7 +194,7 @@ class PolicyNetwork(nn.Module):
             self.wrench_normalizer.fit_mean_std(wrench)
         if self.key_pose:
             assert maps is not None and key_pose is not None, "needs maps and key poses"
-            self.key_pose.fit(maps, *self._hand(state), key_pose[:, 1:])
+            self.key_pose.fit(maps, self._hand(state), key_pose[:, 1:])
         columns, kind = self.config.proprioception, self.config.representation
         self.state_normalizer.fit_mean_std(network_input(state, columns, kind))
         valid = None if action_is_pad is None else ~action_is_pad[..., None]
@@ -232,8 +228,8 @@ class PolicyNetwork(nn.Module):
         if self.key_pose:
             assert batch.maps is not None and key_pose is not None, "needs maps and key poses"
             hand = self._hand(batch.state[:, -1])
-            key_pose_loss = self.key_pose.loss(batch.maps.float(), *hand, key_pose[:, 1:])
-            pose = kp.true_pose(hand[0], key_pose)
+            key_pose_loss = self.key_pose.loss(batch.maps.float(), hand, key_pose[:, 1:])
+            pose = kp.true_pose(hand[:, :7], key_pose)
             draws = 1 if self.end_to_end_encoder else _DRAWS
             rows = batch.touch, batch.state, batch.images, pose, actions, wrench, action_is_pad
             touch, state, images, pose, actions, wrench, action_is_pad = _repeated(rows, draws)
@@ -259,7 +255,7 @@ class PolicyNetwork(nn.Module):
         """Return the position errors of the next two estimated key poses, m."""
         assert self.key_pose and batch.maps is not None, "needs cameras"
         hand = self._hand(batch.state[:, -1])
-        return self.key_pose.error(batch.maps.float(), *hand, key_pose[:, 1:])
+        return self.key_pose.error(batch.maps.float(), hand, key_pose[:, 1:])
 
     def calibrate_key_poses(
         self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]
@@ -267,15 +263,13 @@ class PolicyNetwork(nn.Module):
         """Scale the cameras' expected errors to the actual ones on validation episodes."""
         assert self.key_pose and batch.maps is not None, "needs cameras"
         hand = self._hand(batch.state[:, -1])
-        self.key_pose.calibrate(batch.maps.float(), *hand, key_pose[:, 1:])
+        self.key_pose.calibrate(batch.maps.float(), hand, key_pose[:, 1:])
 
-    def _hand(
-        self, state: Float[Tensor, "b s"]
-    ) -> tuple[Float[Tensor, "b 7"], Float[Tensor, "b 1"]]:
+    def _hand(self, state: Float[Tensor, "b s"]) -> Float[Tensor, "b 8"]:
         """Return the TCP's pose and the gripper's width."""
         widths = [ft.FEATURES[key].shape[0] for key in self.config.proprioception]
         columns = dict(zip(self.config.proprioception, state.split(widths, 1), strict=True))
-        return columns[ft.TCP_POSE], columns[ft.STATE][:, -1:]
+        return torch.cat([columns[ft.TCP_POSE], columns[ft.STATE][:, -1:]], 1)
 
     @torch.inference_mode()
     def plan(
@@ -294,7 +288,7 @@ class PolicyNetwork(nn.Module):
         """
         keeps, pose = average is not None and average.gripper_moves, None
         if self.key_pose and key_pose is not None:
-            pose = kp.true_pose(self._hand(batch.state[:, -1])[0], key_pose)
+            pose = kp.true_pose(self._hand(batch.state[:, -1])[:, :7], key_pose)
         elif self.key_pose:
             assert average is not None, "needs the episode's average, or the true key poses"
             pose = self._estimate(batch, average)
@@ -304,7 +298,7 @@ class PolicyNetwork(nn.Module):
         if widths := self.config.gripper_widths:
             actions[..., -1] = nearest(actions[..., -1], widths)
             if pose is not None and width is not None:
-                tcp = torch.stack([self._hand(state)[0] for state in batch.state.unbind(1)], 1)
+                tcp = torch.stack([self._hand(state)[:, :7] for state in batch.state.unbind(1)], 1)
                 planned = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)
                 actions[..., -1] = width if keeps else planned
         return actions
@@ -312,9 +306,9 @@ class PolicyNetwork(nn.Module):
     def _estimate(self, batch: ObservationBatch, average: KeyPoseAverage) -> Float[Tensor, "b 11"]:
         """Add the cameras' estimates to the average; return it as from `true_pose`."""
         assert self.key_pose and batch.maps is not None, "needs the cameras' feature maps"
-        tcp, width = self._hand(batch.state[:, -1])
-        estimate, weight = self.key_pose(batch.maps.float(), tcp, width)
-        return average.add(estimate, weight, tcp)
+        hand = self._hand(batch.state[:, -1])
+        estimate, weight = self.key_pose(batch.maps.float(), hand)
+        return average.add(estimate, weight, hand[:, :7])
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None

@@ -49,7 +49,8 @@ class Curves:
         fps: frames per second.
         contact: first contact.
         raw: cosine distance 1 - cos in [0, 2] per frame, by modality; touches shorter than 1 are
-            completed to that (see `complete`) unless a normalizer follows.
+            completed to that (see `complete`) unless a normalizer follows. Of a force goal, the
+            difference as a share of it.
         normalised: plain distance (1 the usual start, 0 the usual end, below 0 nearer than that),
             by modality; empty without a normalizer.
         parts: smoothed cost of each part and "fused" per frame, in [0, 1]; empty without units, or
@@ -109,7 +110,10 @@ class Curves:
     @property
     def unit(self) -> str:
         """Axis label of `costs`."""
-        return "distance to goal (normalised)" if self.normalised else "cosine distance to goal"
+        if self.normalised:
+            return "distance to goal (normalised)"
+        alone = set(self.raw) == {"force"}
+        return "share of the goal's force" if alone else "cosine distance to goal"
 
     def metrics(self) -> dict[str, CurveMetrics]:
         """Return the metrics of each cost curve."""

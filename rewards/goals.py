@@ -1,11 +1,13 @@
 """Goals of a trajectory, and the modality that each one applies to; docs/rewards.md has the forms.
 
-Three modalities: "image" (camera image to goal image), "tactile" (touch to goal touch) and "text"
-(touch to goal sentence). Each takes the first goal that applies; one that none takes is an error.
+Four modalities: "image" (camera image to goal image), "tactile" (touch to goal touch), "text"
+(touch to goal sentence) and "force" (grip force to newtons, in place of the goal touch's). Each takes
+the first goal that applies; one that none takes is an error.
 Without touch, and with towers that were trained together (a CLIP), a sentence is a goal for images.
 """
 
 import hashlib
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,10 +34,10 @@ from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.image_file import read_image
 
-Modality = Literal["image", "tactile", "text"]
-MODALITIES: tuple[Modality, ...] = ("image", "tactile", "text")
+Modality = Literal["image", "tactile", "text", "force"]
+MODALITIES: tuple[Modality, ...] = ("image", "tactile", "text", "force")
 
-FORMS = "last, frame:K, image:PATH, episode:ROOT#K, bank:SET, goal:FILE or text:SENTENCE"
+FORMS = "last, frame:K, image:PATH, episode:ROOT#K, bank:SET, goal:FILE, text:SENTENCE or force:N"
 _SMALLEST = 16  # px, the smallest camera image that the environments take
 
 
@@ -61,7 +63,7 @@ class Inputs:
     def modalities(self) -> tuple[Modality, ...]:
         """Modalities that can be measured, given an aligned touch encoder."""
         image: tuple[Modality, ...] = () if self.camera is None else ("image",)
-        return (*image, "tactile", "text") if self.sides else image
+        return (*image, "tactile", "text", "force") if self.sides else image
 
 
 @dataclass(frozen=True)
@@ -206,6 +208,22 @@ class Sentence:
         return f"text:{self.text}" + (f"|{self.baseline}" if self.baseline else "")
 
 
+@dataclass(frozen=True)
+class GripForce:
+    """Normal force on a fingertip, N, mean over the fingertips; UserError if it is not above 0."""
+
+    newtons: float
+    modalities: ClassVar[tuple[Modality, ...]] = ("force",)
+
+    def __post_init__(self) -> None:
+        """Check the force."""
+        if not 0 < self.newtons < math.inf:
+            raise UserError(f"goal '{self}': a force is above 0 N, such as force:3.5")
+
+    def __str__(self) -> str:
+        return f"force:{self.newtons:g}"
+
+
 def content_checksum(spec: "GoalSpec") -> str:
     """Return a text that changes when what a goal refers to does: its image, episodes or file."""
     if isinstance(spec, EpisodeEnd):
@@ -219,7 +237,7 @@ def content_checksum(spec: "GoalSpec") -> str:
     return str(spec)
 
 
-GoalSpec = OwnFrame | GoalImage | TouchArrays | EpisodeEnd | Bank | GoalFile | Sentence
+GoalSpec = OwnFrame | GoalImage | TouchArrays | EpisodeEnd | Bank | GoalFile | Sentence | GripForce
 Goals = Mapping[Modality, GoalSpec]
 """The goal of each modality that has one."""
 GoalLike = GoalSpec | str | int | np.ndarray | Mapping[str, np.ndarray]
@@ -257,6 +275,8 @@ def parse_goal(text: str, keys: Mapping[str, str] | None = None) -> GoalSpec:
     if kind == "text" and value.partition("|")[0].strip():
         sentence, _, baseline = value.partition("|")
         return Sentence(sentence.strip(), baseline.strip())
+    if kind == "force" and re.fullmatch(r"-?\d*\.?\d+", value):
+        return GripForce(float(value))
     raise UserError(f"goal '{text}' is not understood; write {FORMS}")
 
 
@@ -273,7 +293,7 @@ def goals_of_script(goal: GoalLike | Sequence[GoalLike]) -> list[GoalSpec]:
         return [OwnFrame(goal)]
     if isinstance(goal, str):
         known = goal.strip() == "last" or re.match(
-            r"\s*(frame|image|episode|bank|goal|text):", goal
+            r"\s*(frame|image|episode|bank|goal|text|force):", goal
         )
         return [parse_goal(goal) if known else Sentence(goal)]
     if isinstance(goal, Mapping):

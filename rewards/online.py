@@ -7,16 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.control.features import (
-    CAMERAS,
-    CONTROL_HZ,
-    FRONT,
-    IMAGE_PREFIX,
-    TACTILE,
-    WRENCH,
-    Observation,
-)
 from touchgoal.control.interfaces import CostReading
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.rewards.curves import FUSED
@@ -41,7 +33,7 @@ class CostMeter:
     """
 
     def __init__(
-        self, reward: PreparedReward, object_name: str = "", rate: float = CONTROL_HZ
+        self, reward: PreparedReward, object_name: str = "", rate: float = ft.CONTROL_HZ
     ) -> None:
         """Prepare for one run.
 
@@ -61,10 +53,10 @@ class CostMeter:
         self._reward, self._object, self._rate = reward, object_name, rate
         self._goal: EmbeddedGoal | None = None
         self._stream: FeatureStream | None = None
-        self._first: Sequence[Observation] = ()  # that the stream's background is the median of
+        self._first: Sequence[ft.Observation] = ()  # that the stream's background is the median of
         self._parts: dict[str, float] = {}  # cost of each part at the tick before
 
-    def measure(self, observation: Observation, first: Sequence[Observation]) -> float:
+    def measure(self, observation: ft.Observation, first: Sequence[ft.Observation]) -> float:
         """Return the cost of a tick: fused, or the mean over the modalities without parts.
 
         `first` are the run's first ticks in order, at most five. While more of them come in, the
@@ -90,9 +82,9 @@ class CostMeter:
         return float(np.mean([curves.costs[name][-1] for name in curves.raw]))
 
 
-def _stacked(ticks: Sequence[Observation]) -> dict[str, np.ndarray]:
+def _stacked(ticks: Sequence[ft.Observation]) -> dict[str, np.ndarray]:
     """Return what the cost reads of some ticks, by key."""
-    keys = [key for key in (*CAMERAS, *TACTILE, WRENCH) if key in ticks[0]]
+    keys = [key for key in (*ft.CAMERAS, *ft.TACTILE, ft.WRENCH) if key in ticks[0]]
     return {key: np.stack([tick[key] for tick in ticks]) for key in keys}
 
 
@@ -103,17 +95,17 @@ class OnlineCost:
         """Start the thread; `close` ends it. `give_up`: rise of the cost that is a failure; 0: none."""
         self._meter, self._rise = meter, give_up or float("inf")
         self.failed = False  # whether the cost has risen by `give_up` for 20 measurements
-        self._first: tuple[Observation, ...] = ()  # the run's first ticks, without contact
-        self._newest: tuple[float, Observation, tuple[Observation, ...]] | None = None
+        self._first: tuple[ft.Observation, ...] = ()  # the run's first ticks, without contact
+        self._newest: tuple[float, ft.Observation, tuple[ft.Observation, ...]] | None = None
         self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)
 
-    def begin(self, observation: Observation) -> None:
+    def begin(self, observation: ft.Observation) -> None:
         """See Cost; the first measurement warms up the networks."""
         self.failed, self._first = False, ()
-        self._watch, self._watched = FailureWatch(self._rise, CONTROL_HZ), time.monotonic()
+        self._watch, self._watched = FailureWatch(self._rise, ft.CONTROL_HZ), time.monotonic()
         self._newest = time.monotonic(), observation, (observation,)
 
-    def hand_over(self, observation: Observation) -> None:
+    def hand_over(self, observation: ft.Observation) -> None:
         """See Cost."""
         if len(self._first) < START_FRAMES:
             self._first = (*self._first, observation)
@@ -169,11 +161,11 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
     UserError: a goal, encoder or normalizer that does not fit the cell.
     """
     simulated = cell.arm == "sim" or bool(cell.task.twin)
-    cameras = tuple(key for key in CAMERAS if key.removeprefix(IMAGE_PREFIX) in cell.cameras)
+    cameras = tuple(key for key in ft.CAMERAS if key.removeprefix(ft.IMAGE_PREFIX) in cell.cameras)
     inputs = Inputs(
         name="the cell",
-        camera=FRONT if FRONT in cameras else None,
-        sides=TACTILE if cell.fingertips is not None else (),
+        camera=ft.FRONT if ft.FRONT in cameras else None,
+        sides=ft.TACTILE if cell.fingertips is not None else (),
         sensor=cell.sensor,
         scene=f"simulated {cell.task.simulated}" if simulated else REAL_SCENE,
         cameras=cameras,

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE
+from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.preprocess import check_images
 from touchgoal.encoders.pretrained import AnyTouchEncoder
@@ -204,9 +205,13 @@ class Reward:
         check_goals(assigned, inputs)
         embedder = self.embedder(inputs)
         check_words(specs, embedder.encoder is None or embedder.knows_words)
+        if "force" in assigned:
+            sensor = SENSORS.get(embedder.made_with.sensor)
+            if why_not := "the sensor is unknown" if sensor is None else sensor.images_only:
+                raise UserError(f"goal '{assigned['force']}': {why_not}")
         normalizer, value, note = self._choose_normalizer(inputs, assigned, embedder)
         parts = normalizer is not None and bool(normalizer.unit) and not self._plain
-        if not parts:
+        if not parts and "force" not in assigned:
             embedder = self.embedder(inputs, parts=False)
         return PreparedReward(embedder, assigned, normalizer, value, note, self._plain)
 

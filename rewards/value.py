@@ -105,7 +105,7 @@ class Value(nn.Module):
     @classmethod
     def load(cls, folder: Path) -> "Value":
         """Read what `save` wrote; UserError if it is missing or damaged."""
-        value = cls(VALUE_FORMAT.read_config(folder, _config))
+        value = cls(VALUE_FORMAT.read_config(folder, ValueConfig))
         VALUE_FORMAT.load_weights(value, folder)
         return value
 
@@ -164,8 +164,3 @@ def _stacked(features: Features, keys: Sequence[str]) -> Float16[np.ndarray, "n 
     """Return the maps of several cameras, positions flattened."""
     together = np.stack([features[map_name(key)] for key in keys], axis=1)
     return together.reshape(*together.shape[:3], -1)
-
-
-def _config(fields: dict[str, Any]) -> ValueConfig:
-    cameras, shape = tuple(fields["cameras"]), tuple(fields["shape"])
-    return ValueConfig(**{**fields, "cameras": cameras, "shape": shape})

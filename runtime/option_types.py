@@ -41,9 +41,7 @@ def _ordered(bounds: tuple[Number, Number]) -> tuple[Number, Number]:
     return bounds
 
 
-ORDERED = AfterValidator(_ordered)
-PositiveRange = Annotated[tuple[Positive, Positive], ORDERED]
-"""Lower and upper bound; equal bounds fix the value."""
+ORDERED = AfterValidator(_ordered)  # of lower and upper bound; equal bounds fix the value
 
 
 class OptionError(UserError):
@@ -85,3 +83,9 @@ def _problem(error: Any) -> tuple[str, str]:
     if error["type"] == "value_error":  # raised by one of our checks
         return field, error["msg"].removeprefix("Value error, ")
     return field, f"{error['msg'].replace('Input should be', 'must be')}, not {error['input']}"
+
+
+def first_problem(error: ValidationError) -> str:
+    """Return the key of a record's first problem, and what is wrong."""
+    first = error.errors()[0]
+    return ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))

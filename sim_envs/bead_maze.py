@@ -10,8 +10,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.deployment.follower import GRASP_SECONDS
 from touchgoal.control.motion.rotations import fingers_across, rotation_matrix
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import BeadMazeConfig, BeadMazeReset
-from touchgoal.sim_envs.options import with_options
+from touchgoal.sim_envs.config import BeadMazeConfig, BeadMazeReset, with_options
 from touchgoal.sim_envs.scene import wires
 from touchgoal.sim_envs.scene.build import VISUAL_GROUP
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture

@@ -1,11 +1,13 @@
 """Options of the simulated cell and of each task; light to import."""
 
-from dataclasses import replace
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field
 
 from touchgoal.control import features as ft
+from touchgoal.runtime.errors import unknown_name
 from touchgoal.runtime.option_types import (
     FIXED,
     ORDERED,
@@ -91,22 +93,29 @@ class SensorRandomization:
     0.39). The others: differences between published calibrations.
     """
 
-    gain: Annotated[NotNegative, Field(le=0.3)] = (
-        0.047  # standard deviation of each colour channel's
-    )
+    # Standard deviation of each colour channel's.
+    gain: Annotated[NotNegative, Field(le=0.3)] = 0.047
     # Standard deviations of a constant and of a smooth pattern added to the untouched image, of 255.
     offset: NotNegative = 2.4
     pattern: NotNegative = 2.4
     azimuth: Annotated[NotNegative, Field(le=180)] = 15.0  # largest turn of each light, degrees
     blur: Fraction = 0.3  # largest relative change of the gel's smoothing of an imprint
     pixel_pitch: bool = True  # draw the millimetres per pixel from the sensor model's range
-    markers: Fraction = (
-        0.1  # largest shift of dots, share of their spacing, and change of their size
-    )
+    # Share of the model's largest blur by the lens, from which it is drawn.
+    defocus: Fraction = 1.0
+    # Largest shift of dots, share of their spacing, and change of their size.
+    markers: Fraction = 0.1
 
 
 NO_RANDOMIZATION = SensorRandomization(
-    gain=0.0, offset=0.0, pattern=0.0, azimuth=0.0, blur=0.0, pixel_pitch=False, markers=0.0
+    gain=0.0,
+    offset=0.0,
+    pattern=0.0,
+    azimuth=0.0,
+    blur=0.0,
+    pixel_pitch=False,
+    defocus=0.0,
+    markers=0.0,
 )
 
 
@@ -272,10 +281,8 @@ class BeadMazeConfig(EnvConfig):
     """Range of the force of each finger, N."""
     start_angle: Annotated[NotNegative, Field(le=45)] = 0.0
     """Largest angle between hand and wire at the start, degrees."""
-    wire_friction: Annotated[tuple[Friction, Friction], ORDERED, FIXED] = (
-        0.15,
-        0.25,
-    )  # bead on wire
+    # Of the bead on the wire.
+    wire_friction: Annotated[tuple[Friction, Friction], ORDERED, FIXED] = (0.15, 0.25)
     stall_seconds: Annotated[Positive, FIXED] = 5.0  # s without 2 mm of progress: jammed
 
     def chosen_wires(self, count: int | None = None) -> list[Wire]:
@@ -345,3 +352,27 @@ ENVS: dict[TaskName, TaskConfig] = {
 def task_name(config: EnvConfig) -> TaskName:
     """Return the commands' name of a config's task."""
     return next(name for name, kind in TASKS.items() if isinstance(config, kind))
+
+
+Config = TypeVar("Config")
+
+
+def with_options(config: Config, options: Mapping[str, Any]) -> Config:
+    """Return the config with the fields named in `options` replaced.
+
+    UserError: there is no such field, or a value is out of its range.
+
+    Args:
+        options: new values by field name; for a nested config (`randomization`), a config or a
+            mapping of its fields that change.
+    """
+    assert is_dataclass(config) and not isinstance(config, type)
+    names = [field.name for field in fields(config)]
+    changes = {}
+    for name, value in options.items():
+        if name not in names:
+            raise unknown_name(f"option of {type(config).__name__}", name, names)
+        current = getattr(config, name)
+        nested = is_dataclass(current) and isinstance(value, Mapping)
+        changes[name] = with_options(current, value) if nested else value
+    return replace(config, **changes)

@@ -16,7 +16,7 @@ Observation = dict[str, Any]
 _OBSERVATION = "observation."
 
 
-class ForRL(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
+class ForRL(gym.ObservationWrapper[Observation, np.ndarray, Observation]):
     """Keys without dots, actions in [-1, 1], small tactile images, and `is_success` in `info`.
 
     "observation.images.front" becomes "front", "observation.state" becomes "state". An action of -1
@@ -31,41 +31,32 @@ class ForRL(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
         assert isinstance(inner.action_space, gym.spaces.Box)
         self._low, self._high = inner.action_space.low, inner.action_space.high
         self.action_space = gym.spaces.Box(-1.0, 1.0, self._low.shape, np.float32)
+        small = gym.spaces.Box(0, 255, (*TACTILE_SIZE, 3), np.uint8)
         self.observation_space = gym.spaces.Dict(
-            {_short(key): _space(key, space) for key, space in env.observation_space.items()}
+            {
+                _short(key): small if key in TACTILE else space
+                for key, space in env.observation_space.items()
+            }
         )
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; see the environment."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        return _observation(observation), info
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Run one control tick with an action in [-1, 1]; values beyond count as the limits."""
         share = (np.clip(action, -1.0, 1.0) + 1) / 2
         scaled = self._low + share * (self._high - self._low)
-        observation, reward, terminated, truncated, info = self.env.step(scaled)
+        observation, reward, terminated, truncated, info = super().step(scaled)
         info = {**info, "is_success": bool(info[TRUTH_SUCCESS][0])}
-        return _observation(observation), float(reward), terminated, truncated, info
+        return observation, float(reward), terminated, truncated, info
+
+    def observation(self, observation: Observation) -> Observation:
+        """Return an observation under the short keys, its tactile images made smaller."""
+        size = TACTILE_SIZE[::-1]
+        return {
+            _short(key): cv2.resize(value, size, interpolation=cv2.INTER_AREA)
+            if key in TACTILE
+            else value
+            for key, value in observation.items()
+        }
 
 
 def _short(key: str) -> str:
     return key.removeprefix(IMAGE_PREFIX).removeprefix(_OBSERVATION).replace(".", "_")
-
-
-def _space(key: str, space: gym.Space[Any]) -> gym.Space[Any]:
-    if key in TACTILE:
-        return gym.spaces.Box(0, 255, (*TACTILE_SIZE, 3), np.uint8)
-    return space
-
-
-def _observation(observation: Observation) -> Observation:
-    height, width = TACTILE_SIZE
-    return {
-        _short(key): cv2.resize(value, (width, height), interpolation=cv2.INTER_AREA)
-        if key in TACTILE
-        else value
-        for key, value in observation.items()
-    }

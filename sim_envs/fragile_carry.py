@@ -8,8 +8,7 @@ from jaxtyping import Float
 
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.sim_envs.cell.environment import DISTURBANCE_SECONDS, FrankaTactileEnv
-from touchgoal.sim_envs.config import FragileCarryConfig, FragileCarryReset
-from touchgoal.sim_envs.options import with_options
+from touchgoal.sim_envs.config import FragileCarryConfig, FragileCarryReset, with_options
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE, VISUAL_GROUP
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture
 

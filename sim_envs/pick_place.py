@@ -11,8 +11,7 @@ from jaxtyping import Float, Float32
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import PickPlaceConfig, PickPlaceReset
-from touchgoal.sim_envs.options import with_options
+from touchgoal.sim_envs.config import PickPlaceConfig, PickPlaceReset, with_options
 from touchgoal.sim_envs.scene.build import VISUAL_GROUP
 from touchgoal.sim_envs.scene.objects import CATALOGUE, find_object, sample_body
 

@@ -1,13 +1,11 @@
 """Sets that were damaged, or whose recorder was killed: nothing sound is lost."""
 
-import json
 import os
 import shutil
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from toy_episodes import FPS, PNG_START, assert_holds, flip_byte, make_episode, record
 
@@ -125,24 +123,6 @@ def test_impossible_values_are_named(small: Path, old: str, new: str, message: s
             use(small)
     assert validate(small) and repair(small) and validate(small) == []
     assert_holds(small, [0, 1, 2])
-
-
-def test_a_set_of_an_older_version_is_read_and_continued(small: Path) -> None:
-    """It names the pixel format, which lerobot's tools reject, and has no checksum of descriptions."""
-    assert "pix_fmt" not in (small / set_files.INFO).read_text()
-    for path in (small / set_files.data_path(i) for i in range(3)):
-        table = pq.read_table(path)
-        old = json.loads(table.schema.metadata[b"touchgoal"])
-        old["features"][ft.WRIST]["info"]["video.pix_fmt"] = "gbrp"
-        footer = {b"touchgoal": json.dumps(old).encode()}
-        pq.write_table(table.replace_schema_metadata(footer), path, write_page_checksum=True)
-    info = json.loads((small / set_files.INFO).read_text())
-    info["features"][ft.WRIST]["info"]["video.pix_fmt"] = "gbrp"
-    (small / set_files.INFO).write_text(json.dumps(info))
-    assert validate(small) == []
-    EpisodeWriter(small, FPS).append(make_episode(3))
-    assert_holds(small, [0, 1, 2, 3])
-    assert validate(small) == [] and "pix_fmt" not in (small / set_files.INFO).read_text()
 
 
 class Killed(BaseException):

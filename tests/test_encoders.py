@@ -125,6 +125,10 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda d: edit_json(d, lambda j: j["config"].update(preprocessor="gelsight_mini/v0")),
         "gelsight_mini/v0, this version has gelsight_mini/v1",
     ),
+    "another field": (
+        lambda d: edit_json(d, lambda j: j["config"]["vit"].update(layers=3)),
+        r"damaged \(vit.layers: Unexpected keyword",
+    ),
     "future format": (lambda d: edit_json(d, lambda j: j.update(format=99)), "format 99"),
     "wrong weights": (
         wrong_weights,

@@ -135,10 +135,11 @@ def test_episodes_to_come_are_checked_before_any_work(small: Path) -> None:
     writer = EpisodeWriter(small, FPS)
     shapes = {key: values.shape[1:] for key, values in make_episode(0).frames.items()}
     shapes = {key: shape for key, shape in shapes.items() if not key.startswith("truth.")}
-    writer.check_fits(shapes, "pick-place")
+    assert writer.metadata is not None
+    writer.metadata.check_fits(small, shapes, "pick-place")
     for key, shape in ((ft.WRIST, (64, 64, 3)), (ft.FRONT, (32, 48, 3)), (ft.STATE, (13,))):
         with pytest.raises(UserError, match=f"{key} is .* in .* the episodes to come"):
-            writer.check_fits(shapes | {key: shape}, "pick-place")
+            writer.metadata.check_fits(small, shapes | {key: shape}, "pick-place")
 
 
 def test_refusals_say_what_to_do(small: Path) -> None:

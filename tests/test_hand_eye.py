@@ -16,8 +16,7 @@ from PIL import Image
 from touchgoal.control.cell.camera_pose import write_camera
 from touchgoal.control.cell.cell_file import EXAMPLES, cell_table, read_cell_file
 from touchgoal.control.hand_eye.board import BoardView
-from touchgoal.control.hand_eye.record import View, calibrate_camera
-from touchgoal.control.hand_eye.solve import HandEye, calibrate_hand_eye
+from touchgoal.control.hand_eye.solve import HandEye, View, calibrate_camera, calibrate_hand_eye
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
 from touchgoal.control.safety.limits import FR3
 from touchgoal.launch.__main__ import main

@@ -111,23 +111,24 @@ def test_a_camera_finds_a_thing_at_places_never_seen(camera: str) -> None:
     maps = _maps(seen / 0.2 * 4 + 5.5)[:, None]
     torch.manual_seed(0)
     readout = KeyPoseReadout(ImageInputConfig((camera,), (96, 96)))
-    readout.fit(maps[:512], tcp[:512], width[:512], key[:512])
+    hand = torch.cat([tcp, width], 1)
+    readout.fit(maps[:512], hand[:512], key[:512])
     optimizer = torch.optim.AdamW(readout.parameters(), 3e-3)
     for step in range(200):
         rows = torch.from_numpy(np.random.default_rng(step).choice(512, 64, replace=False))
         optimizer.zero_grad()
-        loss = readout.loss(maps[rows].float(), tcp[rows], width[rows], key[rows])
+        loss = readout.loss(maps[rows].float(), hand[rows], key[rows])
         loss.backward()
         optimizer.step()
-    off = readout.error(maps[512:].float(), tcp[512:], width[512:], key[512:])
+    others = maps[512:].float(), hand[512:]
+    off = readout.error(*others, key[512:])
     assert (off.median(0).values < 0.025).all()  # where guessing the mean place is 0.1 m off
-    closes = readout(maps[512:].float(), tcp[512:], width[512:])[0][:, 0, 10] > 0.5
+    closes = readout(*others)[0][:, 0, 10] > 0.5
     if camera == ft.FRONT:  # the hand's camera does not know where the left side is
         assert (closes == key[512:, 0, 7].bool()).float().mean() > 0.9
     readout.calibration += 1.0
-    rows = maps[512:].float(), tcp[512:], width[512:]
-    readout.calibrate(*rows, key[512:])
-    estimates, expected, _ = readout.estimates(*rows)
+    readout.calibrate(*others, key[512:])
+    estimates, expected, _ = readout.estimates(*others)
     made = errors(estimates, readout._true(tcp[512:], key[512:]))
     wanted = torch.ones(1, 2, len(GROUPS))
     torch.testing.assert_close((made / expected.exp()).mean(0), wanted, atol=1e-3, rtol=0)

@@ -17,12 +17,12 @@ from touchgoal.launch.__main__ import COMMANDS
 
 # Ceilings fall with every change that removes, and rise only by the budget that an issue names,
 # in a change that says so.
-WHEEL_LINES = 50_140  # of Python
-REPOSITORY_LINES = 60_500  # of Python, outside tests/
-TEST_LINES = 18_550  # of Python
+WHEEL_LINES = 49_950  # of Python
+REPOSITORY_LINES = 60_900  # of Python, outside tests/
+TEST_LINES = 18_710  # of Python
 PAGE_WORDS = 12_000  # README, CHANGELOG and docs/*.md
 COMMANDS_IN_ALL = 32  # sub-commands included
-OPTIONS_IN_ALL = 386  # of all commands, each with its own
+OPTIONS_IN_ALL = 389  # of all commands, each with its own
 
 ROOT = Path(__file__).parents[1]
 _PAGE = (ROOT / "CONTRIBUTING.md").read_text()

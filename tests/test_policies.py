@@ -30,9 +30,8 @@ from touchgoal.policies.by_name import choose_policy, prepare_policy
 from touchgoal.policies.checkpoint import EPISODE_OBJECT, load_policy
 from touchgoal.policies.evaluation import evaluate as evaluation
 from touchgoal.policies.evaluation.evaluate import evaluate, run_trials, trial_specs
-from touchgoal.policies.evaluation.report import film_trials
+from touchgoal.policies.evaluation.report import film_trials, table
 from touchgoal.policies.evaluation.success_rate import SuccessRate
-from touchgoal.policies.evaluation.table import table
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.sight.frozen_images import ImageEmbedder, ImageInputConfig
 from touchgoal.policies.training.embedding_cache import embed_episodes

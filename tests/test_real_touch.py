@@ -7,9 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.published_touch.force_grasps import read_force_grasps
-from benchmarks.real_touch import forces, markers
+from benchmarks.real_touch import forces, markers, touch_spectrum, words
 from benchmarks.real_touch.embedders import find_embedder
 from benchmarks.real_touch.property_probe import (
     adapted_nearest_is_same,
@@ -19,8 +20,10 @@ from benchmarks.real_touch.property_probe import (
 )
 from benchmarks.real_touch.videos import Config, run
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
-from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.pretrained import load_encoder, load_pooled_encoder
 from touchgoal.encoders.towers.towers import OfflineTowers
+from touchgoal.encoders.whitening.adapt import centre
+from touchgoal.encoders.whitening.text_head import rank_sentences
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video
 from touchgoal.launch.__main__ import main
@@ -82,6 +85,52 @@ def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
         return float(within / np.square(means[0] - means[1]).sum())
 
     assert apart(adapted) < 0.7 * apart(load_encoder("gelsight_mini"))
+
+
+def test_the_spectrum_of_touches(tmp_path: Path) -> None:
+    """A wave's power is in its own band; waves pressed on a DIGIT and simulated presses are read."""
+    for i, band in enumerate(touch_spectrum.BANDS):  # 4.62: where a difference of Gaussians peaks
+        wave = np.repeat(np.sin(2 * np.pi * np.arange(400) / (4.62 * band))[None, :, None], 200, 0)
+        change = np.repeat(wave, 3, 2).astype(np.float32)
+        middle = np.zeros((200, 400), bool)
+        middle[60:140, 80:320] = True
+        assert touch_spectrum.band_powers(change, middle).argmax() == i
+    rng = np.random.default_rng(0)
+    for thing in range(4):
+        for take in range(3):
+            image = 100 + rng.normal(0, 1, (320, 240, 3))
+            top, left = rng.integers(10, 150, 2)
+            image[top : top + 60, left : left + 60] += 40 * np.sin(np.arange(60) / 3)[:, None]
+            path = tmp_path / f"touch/thing{thing}/{take}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path.with_suffix(".jpg")), image)
+    real = touch_spectrum.read_digit(tmp_path)
+    assert len(real.of(tuned=True).powers) == len(real.of(tuned=False).powers) == 6
+    assert (real.powers.argmax(1) == 2).all()
+    made = touch_spectrum.simulated_touches("digit", surfaces=3, seed=0)
+    assert len(made.powers) and (made.powers.argmax(1) >= 2).all()  # that unit is out of focus
+
+
+def test_words_stay_right_where_all_touches_lie_to_one_side() -> None:
+    """Touches exactly towards three sentences, and an offset that makes all of them rough."""
+    encoder, towers = load_pooled_encoder("gelsight_mini"), OfflineTowers()
+    goals = encoder.embed_text_goal(rank_sentences(1), towers)
+    shift = 3 * goals[2] - 0.5 * goals.sum(0)
+    features = (goals + shift) @ np.linalg.inv(encoder.whitening.numpy()) + encoder.mean.numpy()
+    touches = [torch.from_numpy(row[None]) for row in features]
+    assert words.name_ranks(encoder, towers, touches)[:, 1].tolist() == [2, 2, 2]
+    centred = centre(encoder, touches, np.arange(3))
+    assert words.name_ranks(centred, towers, touches)[:, 1].tolist() == [0, 1, 2]
+
+
+def test_words_are_judged_by_answers(clips: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(words, "_DRAWS", 1)
+    result = words.run(words.Config(data=clips))
+    assert result["most_frequent"] == pytest.approx([0.4, 0.4, 1.0])
+    shipped, _, _ = result["rows"]
+    assert [sum(answers) for answers in shipped["answers"]] == [15, 15, 15]
+    assert shipped["right"]["bumpiness"] == pytest.approx(shipped["answers"][2][1] / 15)
+    assert [row["objects"] for row in result["few"]] == [1, 3]
 
 
 def test_sentences_are_judged_on_objects_never_seen() -> None:

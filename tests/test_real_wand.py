@@ -21,6 +21,7 @@ from numbered_images import until
 from touchgoal.control import features as ft
 from touchgoal.control.cell.wand import WandReading
 from touchgoal.control.cell.wand_recorder import WandRecorder
+from touchgoal.control.sensors.live_image import StreamServer
 from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.control.wand_touch import FORCE_RANGES, MAX_FORCE, WandTouch
@@ -29,7 +30,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.wand import recording as wand_recording
 from touchgoal.launch.__main__ import main
 from touchgoal.sim_envs.touch_wand import TouchWand
-from touchgoal.sim_envs.twin.mjpeg import Stream, StreamServer
+from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
 from touchgoal.sim_envs.wand.objects import find_wand_object
 

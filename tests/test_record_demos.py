@@ -29,8 +29,7 @@ from touchgoal.control.teleoperation.device import HandMotion, TeleoperationDevi
 from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
 from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
-from touchgoal.control.teleoperation.teleoperator import Teleoperator
-from touchgoal.control.teleoperation.yielding import YieldingHand
+from touchgoal.control.teleoperation.teleoperator import Teleoperator, YieldingHand
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch import record_demos
 from touchgoal.launch.deploy import NOT_DONE

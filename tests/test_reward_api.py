@@ -118,6 +118,7 @@ def test_goals_as_arrays_are_those_of_the_same_frame(encoder: TouchEncoder) -> N
         ({}, {"images": IMAGES, "tactile": {"left": IMAGES[:3]}}, "images 12, left 3"),
         ({"goal": {"left": IMAGES[0]}}, {"images": IMAGES}, "must be the trajectory's"),
         ({"encoder": "nobody"}, {"tactile": TOUCH}, "no touch encoder 'nobody'"),
+        ({"goal": "force:3"}, {"images": IMAGES}, "applies to force, but this source has image"),
     ],
 )
 def test_a_mistake_is_one_line(

@@ -117,15 +117,30 @@ def test_a_failure_of_each_part_raises_that_part(
         compute_curves(end, goal, normalizer, value).parts for end in ends
     )
     assert {name: cost[-1] < 0.5 for name, cost in good.items()} == dict.fromkeys(good, True)
-    assert hard["force"][-1] > good["force"][-1] + 0.4
-    assert hard["fused"] == pytest.approx(good["fused"]), "force is a line of its own"
-    for failure, name in ((slid, "slip"), (pressed, "wrench")):
+    for failure, name in ((hard, "force"), (slid, "slip"), (pressed, "wrench")):
         assert failure[name][-1] > good[name][-1] + 0.4
         assert failure["fused"][-1] > good["fused"][-1] + 0.05
     for name in ("front", "wrist", "wrist_map", "value", "fused"):
         assert early[name][-1] > good[name][-1] + 0.2, name
     for cost in good.values():
         assert 0 <= cost.min() and cost.max() <= 1
+
+
+def test_a_force_is_a_goal(
+    successes: list[EmbeddedEpisode], normalizer: DistanceNormalizer
+) -> None:
+    """Alone or beside a touch, whose own force it replaces; its unit is half of it."""
+    newtons, forms = {"force": np.full((1, 2), 8, np.float32)}, {"force": "force:8"}
+    mine, alone = embedded(9, force=12.0), EmbeddedGoal(newtons, forms)
+    costs = compute_curves(mine, alone, normalizer)
+    assert costs.parts.keys() == {"force", "fused"} and costs.plain.keys() == {"force"}
+    assert costs.parts["force"][:GRASP] == pytest.approx(np.ones(GRASP))
+    assert costs.parts["force"][-1] == pytest.approx(0.31, abs=0.1)  # 4^2 / (4^2 + 6^2)
+    raw = compute_curves(mine, alone, None).costs["force"]
+    assert raw[:GRASP] == pytest.approx(np.ones(GRASP)) and raw[-1] == pytest.approx(0.5, abs=0.15)
+    touch = EmbeddedGoal({**last_rows([successes[0]]), **newtons}, forms)
+    beside = compute_curves(mine, touch, normalizer).parts
+    assert beside["force"] == pytest.approx(costs.parts["force"]) and "object" in beside
 
 
 def test_before_contact_the_fingertips_cost_the_same_whatever_they_read(
@@ -162,7 +177,8 @@ def test_distances_by_hand() -> None:
 
     light = readings([True, False], [9.5, 0], [3e-3, 0])
     d = contact_distances(light, readings([True], [39.5], [0]))
-    assert d["force"][:, 0] == pytest.approx([np.log(4), np.log(80)])
+    wanted = {"force": np.full((1, 1), 39.5, np.float32)}
+    assert part_distances(light, wanted)["force"][:, 0].tolist() == [30, 39.5]
     assert d["centre"][:, 0] == pytest.approx([3e-3, 0.02]) and d["held"][:, 0].tolist() == [0, 1]
     along, short = np.array([[[1.0, 0]]], np.float32), np.array([[[0.5, 0]]], np.float32)
     assert object_distances(along, along)[0, 0] == 0
@@ -202,7 +218,7 @@ def test_goals_that_differ_widen_the_unit(successes: list[EmbeddedEpisode]) -> N
 
 def test_units_are_those_of_ends_with_the_same_object(successes: list[EmbeddedEpisode]) -> None:
     units = fit_units(successes)
-    assert units["force"] < 0.3 and units["held"] == pytest.approx(1 / 3)
+    assert 0.5 <= units["force"] < 2 and units["held"] == pytest.approx(1 / 3)
     strangers = [replace(e, object=str(i)) for i, e in enumerate(successes)]
     assert fit_units(strangers) == {}
 

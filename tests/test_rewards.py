@@ -22,6 +22,7 @@ from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal, t
 from touchgoal.rewards.goals import (
     EpisodeEnd,
     GoalImage,
+    GripForce,
     Modality,
     OwnFrame,
     Sentence,
@@ -94,13 +95,14 @@ def goal_of(episode: EmbeddedEpisode, *names: str) -> EmbeddedGoal:
         ("image:ends/cup.png", GoalImage(Path("ends/cup.png"))),
         ("episode:data/a#b#12", EpisodeEnd(Path("data/a#b"), 12)),
         ("text:hard, smooth: round", Sentence("hard, smooth: round")),
+        ("force:3.5", GripForce(3.5)),
     ],
 )
 def test_goal_is_read_and_written_back(text: str, goal: object) -> None:
     assert parse_goal(text) == goal and str(goal) == text
 
 
-@pytest.mark.parametrize("text", ["lst", "frame:-1", "image:", "episode:data", "text:  "])
+@pytest.mark.parametrize("text", ["lst", "frame:-1", "image:", "episode:data", "force:hard"])
 def test_unknown_goal_lists_the_forms(text: str) -> None:
     with pytest.raises(UserError, match="last, frame:K, image:PATH, episode:ROOT#K, bank:SET"):
         parse_goal(text)
@@ -114,11 +116,12 @@ def test_unknown_goal_lists_the_forms(text: str) -> None:
         ("a round thing|an object without texture", "hardly notices 'without'"),
         ("a hard, soft ball", "says both 'soft' and 'hard'"),
         ("Rough. It feels smooth.", "says both 'smooth' and 'rough'"),
+        ("force:-3", "a force is above 0 N"),
     ],
 )
-def test_negated_and_contradictory_sentences_are_refused(text: str, cause: str) -> None:
+def test_goals_that_mean_nothing_are_refused(text: str, cause: str) -> None:
     with pytest.raises(UserError, match=cause):
-        parse_goal(f"text:{text}")
+        parse_goal(text if text.startswith("force:") else f"text:{text}")
 
 
 @pytest.mark.parametrize("text", ["a knotted cotton net", "a hard ball, notably smooth"])

@@ -25,7 +25,8 @@ from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 def test_shadows_fall_opposite_the_bright_sides(sensor: SensorModel, largest_turn: float) -> None:
     """Each light alone on a bump: bright towards the light, shadow behind."""
     lights = replace(NO_RANDOMIZATION, azimuth=largest_turn)
-    y, x = np.mgrid[:120, :160].astype(np.float32) - np.array([60, 80], np.float32)[:, None, None]
+    middle = np.array(sensor.image_shape) // 4
+    y, x = np.mgrid[: 2 * middle[0], : 2 * middle[1]].astype(np.float32) - middle[:, None, None]
     bump = 6e-4 * np.exp(-(x**2 + y**2) / (2 * 9**2)).astype(np.float32)
     for seed in range(4):
         instance = sample_instance(sensor, np.random.default_rng(seed), lights)

@@ -16,6 +16,7 @@ from numbered_images import BITS, numbered, until
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors import video
 from touchgoal.control.sensors.image_integrity import FrozenParts
+from touchgoal.control.sensors.live_image import StreamServer
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
     GELSIGHT_MINI_CROP,
@@ -35,7 +36,7 @@ from touchgoal.control.tactile.sensor_models import (
 )
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.tactile.markers import draw, rest_positions
-from touchgoal.sim_envs.twin.mjpeg import Stream, StreamServer
+from touchgoal.sim_envs.twin.mjpeg import Stream
 
 
 def number(image: np.ndarray) -> int:

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from touchgoal.control.sensors.clip import read_frames
 from touchgoal.control.sensors.tactile_camera import rectify
 from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
-from touchgoal.episodes.importers.tables import check_there, read_table
+from touchgoal.episodes.importers.labelled_videos import check_there, read_table
 from touchgoal.runtime.option_types import Corners
 
 _COLUMNS = ("force_newtons", "gripper_width_m")

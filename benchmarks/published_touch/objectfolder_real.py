@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.episodes.importers.tables import check_there, read_table
+from touchgoal.episodes.importers.labelled_videos import check_there, read_table
 from touchgoal.episodes.importers.touch_clip import read_image_file
 from touchgoal.runtime.errors import UserError
 

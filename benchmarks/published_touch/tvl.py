@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from touchgoal.episodes.importers.tables import check_there
+from touchgoal.episodes.importers.labelled_videos import check_there
 from touchgoal.runtime.errors import UserError
 
 _NUMBER = re.compile(r"image_(\d+)_rgb")

@@ -77,7 +77,7 @@ def predict_properties(
     The ridge's strength is chosen by folds within the training objects, never on the judged ones.
     """
     scores = np.zeros((*ranks.shape, N_RANKS))
-    for test in _folds(objects):
+    for test in folds(objects):
         known = embeddings[~test], ranks[~test], objects[~test]
         scores[test] = _ridge(*known[:2], embeddings[test], _choose_strength(*known))
     return PropertyPrediction(scores.argmax(2), scores @ np.arange(N_RANKS))
@@ -136,13 +136,13 @@ def _adapted(
     embeddings: Float[np.ndarray, "n d"], objects: Objects
 ) -> Iterator[tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "n d"]]]:
     """Yield each fold and all videos, centred and whitened by the other folds."""
-    for test in _folds(objects):
+    for test in folds(objects):
         known = embeddings[~test]
         whitening = inverse_square_root(within_classes(known, objects[~test]), _SHRINKAGE)
         yield test, (embeddings - known.mean(0)) @ whitening
 
 
-def _folds(objects: Objects) -> Iterator[Bool[np.ndarray, " n"]]:
+def folds(objects: Objects) -> Iterator[Bool[np.ndarray, " n"]]:
     """Yield the videos of each tenth of the objects."""
     names = np.random.default_rng(0).permutation(np.unique(objects))
     for fold in range(_FOLDS):
@@ -153,7 +153,7 @@ def _folds(objects: Objects) -> Iterator[Bool[np.ndarray, " n"]]:
 
 def _choose_strength(embeddings: np.ndarray, ranks: np.ndarray, objects: np.ndarray) -> float:
     right = dict.fromkeys(STRENGTHS, 0)
-    for test in _folds(objects):
+    for test in folds(objects):
         for strength in STRENGTHS:
             scores = _ridge(embeddings[~test], ranks[~test], embeddings[test], strength)
             right[strength] += int((scores.argmax(2) == ranks[test]).sum())

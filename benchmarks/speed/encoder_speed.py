@@ -7,7 +7,7 @@ its embedding.
 
 import copy
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Annotated, Any, Literal, get_args
 
@@ -22,7 +22,7 @@ from benchmarks.speed.rates import in_turn, one_core
 from benchmarks.speed.reward_parts import parts_table, time_parts
 from touchgoal.encoders.backbones.frame_history import RecentFrames
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
-from touchgoal.encoders.backbones.sparsh import sparsh_vit
+from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
 from touchgoal.encoders.backbones.sparsh_input import SPARSH
 from touchgoal.encoders.backbones.touch_backbone import (
     BaseTouchEncoder,
@@ -57,6 +57,7 @@ class Config(BenchmarkOptions):
     """Single frames in each measurement."""
 
 
+_SIZES = {"tiny": (192, 3), "small": (384, 6), "base": (768, 12)}  # width, heads
 _DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
 _FRAME = 240, 320  # px, of a sensor
 _STREAM = 16  # distinct frames
@@ -99,7 +100,8 @@ def run(config: Config) -> dict[str, Any]:
 
 def _random(name: str) -> TouchBackbone:
     method, size = name.split("-")
-    vit = sparsh_vit(method, size)
+    width, heads = _SIZES[size]
+    vit = replace(SPARSH_BASE[method], width=width, heads=heads)
     stride = STRIDES["clip" if vit.tubelet > 1 else "pair"]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)

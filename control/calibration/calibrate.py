@@ -91,7 +91,9 @@ def fit(
     With `squares` the response also varies with the squared position, for gels whose light falls
     off towards the borders.
     """
-    background, varies_over_image = median_background(presses), _spread_out(presses)
+    background, (rows, columns) = median_background(presses), presses.background.shape[:2]
+    spread = presses.circles[:, :2].std(0)
+    varies_over_image = bool((spread > _MIN_SPREAD * np.array([columns, rows])).all())
     steps = press_fit.PressFit(
         presses, background, varies_over_image, illumination_exponent, trust_labels
     )
@@ -207,11 +209,6 @@ def _noise(presses: PressSet) -> float:
         fine = np.abs(change - cv2.GaussianBlur(change, (0, 0), 3))
         spreads.append(1.4826 * np.median(fine))  # robust against the contacts
     return float(np.mean(spreads))
-
-
-def _spread_out(presses: PressSet) -> bool:
-    rows, cols, _ = presses.background.shape
-    return bool((presses.circles[:, :2].std(0) > _MIN_SPREAD * np.array([cols, rows])).all())
 
 
 def _with_limits(state: press_fit.FitState) -> SensorCalibration:

@@ -170,7 +170,7 @@ class TaskSection:
     """Scene of a simulated arm or a twin for a task of your own: that of pick-place or bead-maze."""
     rewards: tuple[str, ...] = ()
     """Goals whose distance is shown and recorded during the run, as those of reward-curves:
-    episode:FOLDER#K, image:PATH, text:SENTENCE."""
+    episode:FOLDER#K, image:PATH, text:SENTENCE, force:N."""
     encoder: str = ""
     """Touch encoder for that distance, by name or folder; sentences need one aligned with texts. Default:
     the one that ships for the fingertips."""

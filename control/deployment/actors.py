@@ -13,7 +13,7 @@ from touchgoal.control.deployment.scripted import PickPlacePoses, pick_and_place
 from touchgoal.control.interfaces import Actor, Planner
 from touchgoal.control.motion.tracker import ServoLag
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.control.teleoperation.yielding import YieldingHand
+from touchgoal.control.teleoperation.teleoperator import YieldingHand
 from touchgoal.runtime.errors import UserError
 
 _SIMULATED_PLAN_TIMEOUT = 20.0  # s of wall time that a simulated arm waits for a plan

@@ -17,19 +17,12 @@ from typing import Literal
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control import interfaces
 from touchgoal.control.arms.driver_process import error_line
 from touchgoal.control.cell.connection import CellConnection, RealClock
 from touchgoal.control.deployment.hand import HandMonitor, HeldObject, require_empty_hand
 from touchgoal.control.deployment.observation import CellReading, ObservationReader
 from touchgoal.control.features import read_only
-from touchgoal.control.interfaces import (
-    STOPPED_ON_REQUEST,
-    Actor,
-    ArmReading,
-    Cost,
-    CostReading,
-    DriverError,
-)
 from touchgoal.control.run_log import SLOW_ARM, RunLog, slow_arm
 from touchgoal.control.safety.action_filter import ActionFilter, Limit, Measurements, SafetyState
 from touchgoal.runtime.errors import UserError
@@ -112,7 +105,7 @@ class TickStatus:
     reading: CellReading
     width: float
     late: float
-    cost: CostReading | None
+    cost: interfaces.CostReading | None
 
 
 class ControlLoop:
@@ -125,7 +118,7 @@ class ControlLoop:
         execute: bool,
         operator_request: Callable[[], Request],
         on_tick: Callable[[TickStatus], None],
-        cost: Cost | None = None,
+        cost: interfaces.Cost | None = None,
         camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2],
     ) -> None:
         """Begin with the arm at rest.
@@ -149,7 +142,7 @@ class ControlLoop:
         except UserError:
             raise
         except Exception as error:  # of any driver; nothing has moved
-            raise DriverError(error_line(error)) from error
+            raise interfaces.DriverError(error_line(error)) from error
         if self.reader.has_fingertips:
             require_empty_hand(gripper)
         self.width = gripper.width
@@ -160,7 +153,7 @@ class ControlLoop:
         """Joint positions (rad) commanded now."""
         return self.state.q
 
-    def run(self, actor: Actor, seconds: float, log: RunLog) -> Ending:
+    def run(self, actor: interfaces.Actor, seconds: float, log: RunLog) -> Ending:
         """Run the actor until it is done, time is up, a person ends it or a fault stops it."""
         try:
             real = isinstance(self._connection.clock, RealClock)
@@ -177,7 +170,7 @@ class ControlLoop:
         finally:
             _done(actor.close)
 
-    def _loop(self, actor: Actor, seconds: float, log: RunLog) -> Ending:
+    def _loop(self, actor: interfaces.Actor, seconds: float, log: RunLog) -> Ending:
         clock = self._connection.clock
         observation = read_only(self._read().observation)
         if self._cost:
@@ -234,11 +227,13 @@ class ControlLoop:
         fault = ""
         with suppress(Exception):
             fault = self._connection.arm.read().fault
-        if not fault or fault.startswith(STOPPED_ON_REQUEST) or fault in ending.reason:
+        if not fault or fault.startswith(interfaces.STOPPED_ON_REQUEST) or fault in ending.reason:
             return ending
         return replace(ending, reason=f"arm: {fault}; also: {ending.reason}")
 
-    def _tick(self, actor: Actor, log: RunLog, seconds: float, late: float) -> Ending | None:
+    def _tick(
+        self, actor: interfaces.Actor, log: RunLog, seconds: float, late: float
+    ) -> Ending | None:
         reading = self._read()
         log.clocks.extend((self._connection.clock.now(), reading.arm.time))
         if not self._execute:
@@ -352,7 +347,7 @@ def _done(call: Callable[[], None]) -> bool:
     return False
 
 
-def _speed(before: ArmReading, now: ArmReading) -> float:
+def _speed(before: interfaces.ArmReading, now: interfaces.ArmReading) -> float:
     """Speed of the fastest joint, rad/s; from differences if the arm reports none."""
     if np.isfinite(now.velocity).all():
         return float(np.abs(now.velocity).max())

@@ -9,12 +9,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.cell.limits import cell_watchdogs
-from touchgoal.control.deployment.control_loop import (
-    ControlLoop,
-    Ending,
-    Request,
-    TickStatus,
-)
+from touchgoal.control.deployment.control_loop import ControlLoop, Ending, Request, TickStatus
 from touchgoal.control.deployment.scripted import PlannedMove, ScriptedActor, start_move
 from touchgoal.control.interfaces import Joints
 from touchgoal.control.motion.arm_models import ArmModel

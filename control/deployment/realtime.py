@@ -11,7 +11,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor, Planner
 from touchgoal.control.motion.tracker import ServoLag
-from touchgoal.control.teleoperation.yielding import YieldingHand
+from touchgoal.control.teleoperation.teleoperator import YieldingHand
 from touchgoal.runtime.errors import UserError
 
 _FIRST_PLAN_TIMEOUT = 20.0  # s for the first plan; it warms everything up

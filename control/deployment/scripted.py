@@ -9,15 +9,10 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
+from touchgoal.control.motion import trajectories
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.self_collision import SelfDistance, require_no_self_collision
-from touchgoal.control.motion.trajectories import (
-    Trajectory,
-    joint_move,
-    require_inside_workspace,
-    straight_line,
-)
 from touchgoal.control.safety.action_filter import ActionFilter
 
 _SPEED_SHARE = 0.9  # share of the policy's limits: a plan should not be clamped
@@ -45,7 +40,7 @@ class PickPlacePoses:
 class PlannedMove:
     """A move along a path, or a wait (None), with the gripper's target width (m)."""
 
-    path: Trajectory | None
+    path: trajectories.Trajectory | None
     width: float
     seconds: float  # duration, at least the path's own
     until_supported: bool = False  # end early once the table carries the object
@@ -103,8 +98,8 @@ def start_move(
     UserError if it leaves the workspace or leads the arm into itself.
     """
     limits = safety.joints.scaled(_START_SPEED_SHARE, _START_SPEED_SHARE)
-    path = joint_move(commanded(), goal, limits)
-    require_inside_workspace(path, safety)
+    path = trajectories.joint_move(commanded(), goal, limits)
+    trajectories.require_inside_workspace(path, safety)
     require_no_self_collision(path, SelfDistance(safety.limits.arm))
     return ScriptedActor([PlannedMove(path, width, path.duration)], commanded, 1 / safety.dt)
 
@@ -132,8 +127,8 @@ def pick_and_place(
         to: np.ndarray, width: float, least: float = 0.0, until_supported: bool = False
     ) -> PlannedMove:
         nonlocal q
-        path = straight_line(kinematics, q, to, fingers_down(yaw), limits)
-        require_inside_workspace(path, safety)
+        path = trajectories.straight_line(kinematics, q, to, fingers_down(yaw), limits)
+        trajectories.require_inside_workspace(path, safety)
         q = path.at(path.duration)
         return PlannedMove(path, width, max(path.duration, least), until_supported)
 

@@ -20,7 +20,12 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from touchgoal.control.hand_eye.board import BoardView
+from touchgoal.control.arrays import Image
+from touchgoal.control.cell.connection import CellConnection
+from touchgoal.control.hand_eye.board import Board, BoardView
+from touchgoal.control.interfaces import Joints
+from touchgoal.control.motion.arm_models import ArmModel
+from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
 from touchgoal.runtime.errors import UserError
 
@@ -187,13 +192,12 @@ class _Estimate:
     def moved(self, change: Float[np.ndarray, " p"]) -> "_Estimate":
         own = self.lens
         lens = np.array(astuple(own)) + change[:6] * [own.fx, own.fy, own.fx, own.fy, 1.0, 1.0]
-        camera, board = (
-            self.camera @ _transform(change[6:12]),
+        camera = self.camera @ _transform(change[6:12])
+        board, scale = (
             self.board @ _transform(change[12:18]),
+            self.scale * float(np.exp(change[18])),
         )
-        return _Estimate(
-            Lens(*lens.tolist()), camera, board, self.scale * float(np.exp(change[18]))
-        )
+        return _Estimate(Lens(*lens.tolist()), camera, board, scale)
 
     def board_seen(self, motions: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
         return np.linalg.inv(self.camera) @ motions @ self.board
@@ -267,3 +271,42 @@ def _transform(change: Float[np.ndarray, "6"]) -> Transform:
 def _vector(T: Transform) -> Float[np.ndarray, "6"]:
     """Return the inverse of `_transform`."""
     return np.append(rotation_vector(T[:3, :3]), T[:3, 3])
+
+
+_SETTLING = 0.5  # s after which an arm swings no more and images are newer than its motion
+_REST = 0.01  # rad/s
+
+
+@dataclass(frozen=True)
+class View:
+    """An image, the arm's measured joint positions (rad) in it, and the board if it is seen."""
+
+    image: Image
+    q: Joints
+    board: BoardView | None
+
+
+def take_view(connection: CellConnection, camera: str, board: Board) -> View:
+    """Take a view by the connection's camera of that key; UserError if the arm moves."""
+    clock = connection.clock
+    clock.wait(clock.now() + _SETTLING)
+    reading = connection.arm.read()
+    image = connection.cameras[camera].read().image
+    if np.abs(reading.velocity).max() > _REST:
+        raise UserError("the arm moves: hold it still for a view")
+    return View(image, reading.q, board.find(image))
+
+
+def calibrate_camera(views: list[View], arm: ArmModel, on_hand: bool) -> HandEye:
+    """Calibrate from the views that show the board; see `calibrate_hand_eye`."""
+    kinematics = Kinematics(arm, 0.0)
+    seen = [(view.board, _pose(kinematics, view.q)) for view in views if view.board is not None]
+    rows, columns = views[0].image.shape[:2] if views else (0, 0)
+    boards, poses = [board for board, _ in seen], [pose for _, pose in seen]
+    return calibrate_hand_eye(boards, poses, (columns, rows), on_hand)
+
+
+def _pose(kinematics: Kinematics, q: Joints) -> Transform:
+    T = np.eye(4)
+    T[:3, 3], T[:3, :3] = kinematics.forward(q)
+    return T

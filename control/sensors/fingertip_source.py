@@ -8,13 +8,8 @@ from pathlib import Path
 
 from touchgoal.control.arrays import Image
 from touchgoal.control.interfaces import DriverError
+from touchgoal.control.sensors import tactile_camera
 from touchgoal.control.sensors.clip import open_clip
-from touchgoal.control.sensors.tactile_camera import (
-    Crop,
-    TactileCamera,
-    crop_to_sensor,
-    fingertip_view,
-)
 from touchgoal.control.sensors.usb_cameras import find_sensor_camera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import SensorModel
@@ -48,8 +43,8 @@ def open_frames(
         return
     video = fingertip_video(source, model)
     locked = replace(video, exposure=exposure, white_balance=white_balance)
-    view = fingertip_view(model, source, corners=corners)
-    camera = TactileCamera(VideoCamera(locked), model, view)
+    view = tactile_camera.fingertip_view(model, source, corners=corners)
+    camera = tactile_camera.TactileCamera(VideoCamera(locked), model, view)
     last, heard = -1, time.monotonic()
     end = heard + seconds
     try:
@@ -84,6 +79,6 @@ def recorded_frames(
     Without corners of the gel the images count as already cut. UserError if there are none, or
     they have other proportions than the sensor's.
     """
-    view = Crop(corners=corners)
+    view = tactile_camera.Crop(corners=corners)
     for frame in open_clip(source).frames():
-        yield crop_to_sensor(frame, model, view)
+        yield tactile_camera.crop_to_sensor(frame, model, view)

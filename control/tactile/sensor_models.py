@@ -39,6 +39,7 @@ class SensorModel:
     frame_rate: float  # Hz
     sensor_file: Path  # folder with the calibration of a typical sensor (`sensor_calibration`)
     markers: MarkerGrid | None = None  # dots printed on the gel, if any
+    defocus: float = 0.0  # standard deviation of the camera's largest blur by its lens, px
     measured: bool = True  # whether the sensor file was fitted to presses, not computed
 
     @property
@@ -109,7 +110,8 @@ GELSIGHT_MARKERS = replace(
 # images do not show them. Sources range from 0.0405 (gs_sdk, at VGA) over 0.0511 (FOTS) to 0.0667
 # (a 16 x 19 mm sensing field). Case 32.3 x 27 x 34 mm: its STL. Gel 20 x 30 mm: TACTO, which also
 # bends it by 5 mm (R 100 mm); flat here. Thickness and moduli are not published: a third thinner
-# than the Mini's, of the same silicone.
+# than the Mini's, of the same silicone. Its lens turns in a thread: FOTS' unit is in focus, that of
+# visuo-tactile-clustering is blurred by about 4 px.
 DIGIT = SensorModel(
     name="digit",
     image_shape=(320, 240),
@@ -124,6 +126,7 @@ DIGIT = SensorModel(
     shear_stiffness=9.0e3,
     frame_rate=60.0,
     sensor_file=_FILES / "digit",
+    defocus=5.0,
 )
 
 # A finger whose camera sees the gel at an angle (Wang et al. 2021, arXiv 2106.08851); its image

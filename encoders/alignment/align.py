@@ -27,16 +27,10 @@ from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncode
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.backbones.vit import ViTConfig, random_masking
 from touchgoal.encoders.towers.towers import Towers
+from touchgoal.encoders.training import trainer
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.encoders.training.trainer import (
-    OptimizerConfig,
-    Training,
-    fit,
-    gather_batch,
-    on_first_process,
-)
 from touchgoal.episodes.touches import Touches
 
 _ENCODER = "encoder"
@@ -81,7 +75,7 @@ def align(
         if max(history, key=_score) is history[-1]:
             best.load_state_dict(encoder.state_dict())
 
-    training = Training(
+    training = trainer.Training(
         loss=loss,
         n_samples=len(data),
         batch=lambda rows, noise: make_batch(data, rows, config, noise),
@@ -96,7 +90,7 @@ def align(
         after_epoch=update_best,
         extra_state={"best": best},
     )
-    history, provenance = fit(training, out_dir, options, recipe)
+    history, provenance = trainer.fit(training, out_dir, options, recipe)
     encoder.load_state_dict(best.state_dict())
     provenance |= {
         "align": asdict(config),
@@ -104,7 +98,7 @@ def align(
         "metrics": max(history, key=_score),
         "test_metrics": evaluate_retrieval(encoder, test),
     }
-    on_first_process(lambda: pretrained.save(encoder, out_dir / _ENCODER, provenance))
+    trainer.on_first_process(lambda: pretrained.save(encoder, out_dir / _ENCODER, provenance))
     return cast(TouchEncoder, pretrained.load_encoder(out_dir / _ENCODER))
 
 
@@ -113,9 +107,9 @@ def find_vit(config: AlignConfig) -> ViTConfig | None:
     return VIT_PRESETS.get(config.backbone.removeprefix("vit-"))
 
 
-def optimizer_config(config: AlignConfig) -> OptimizerConfig:
+def optimizer_config(config: AlignConfig) -> trainer.OptimizerConfig:
     """Return the settings of the optimizer."""
-    return OptimizerConfig(
+    return trainer.OptimizerConfig(
         config.epochs,
         config.batch_size,
         config.lr,
@@ -171,7 +165,7 @@ class AlignmentLoss(nn.Module):
 
     def forward(self, **batch: Tensor | None) -> dict[str, Float[Tensor, ""]]:
         """Return `batch_losses` of what `make_batch` returns, in float32 whatever the precision."""
-        embedded = self.embed(batch, gather_batch)
+        embedded = self.embed(batch, trainer.gather_batch)
         with torch.autocast(embedded.touch.device.type, enabled=False):
             return batch_losses(embedded, self.encoder.config.pretrained_together, self.config)
 

@@ -64,12 +64,13 @@ def prepare_touch_data(
     sentences, describes = _sentences(
         names, touches.descriptions | {NO_CONTACT: list(no_contact_texts)}
     )
+    starts = track(range(0, len(touches.view), BATCH), "embed views", "batch")
     return TouchData(
         touch=_preprocess(touches, used, sensor),
         label=torch.from_numpy(np.searchsorted(names, objects)),
         contact=torch.from_numpy(objects != NO_CONTACT),
         view_index=torch.from_numpy(touches.view_index[used].astype(np.int64)),
-        images=_embed_views(touches.view, towers),
+        images=torch.cat([towers.embed_images(touches.view[i : i + BATCH]) for i in starts]),
         texts=towers.embed_texts(sentences),
         describes=describes,
         names=names,
@@ -109,11 +110,6 @@ def _preprocess(touches: Touches, rows: np.ndarray, sensor: str) -> Float16[Tens
         background = touches.background[touches.background_index[row]]
         out[i] = torch.from_numpy(preprocess(touches.frames[row : row + 1], background)[0])
     return out
-
-
-def _embed_views(views: np.ndarray, towers: Towers) -> Float[Tensor, "e i"]:
-    starts = track(range(0, len(views), BATCH), "embed views", "batch")
-    return torch.cat([towers.embed_images(views[i : i + BATCH]) for i in starts])
 
 
 def augment(

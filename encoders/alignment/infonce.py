@@ -43,9 +43,7 @@ def symmetric_info_nce(
 
 @torch.no_grad()
 def loss_floor(
-    target: Float[Tensor, "n d"],
-    temperature: float,
-    positives: Bool[Tensor, "n n"] | None = None,
+    target: Float[Tensor, "n d"], temperature: float, positives: Bool[Tensor, "n n"] | None = None
 ) -> float:
     """Return the least `info_nce` that any anchors can reach against these fixed targets.
 

@@ -5,20 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from touchgoal.encoders.annotation.boxes import Box, Image, crop
+from touchgoal.encoders.annotation import matching, records
+from touchgoal.encoders.annotation.boxes import Box, Image, crop, track_csrt
 from touchgoal.encoders.annotation.config import AnnotationSettings
-from touchgoal.encoders.annotation.frame_matching import match_contact, match_reference
-from touchgoal.encoders.annotation.instance_matching import match_instance, select_instances
 from touchgoal.encoders.annotation.models import AnnotationModels
-from touchgoal.encoders.annotation.records import (
-    AnnotatedTouch,
-    Contact,
-    Instance,
-    LeftOut,
-    LeftOutRecording,
-    LinesFile,
-)
-from touchgoal.encoders.annotation.sensor_tracking import track_csrt
 from touchgoal.episodes.importers.visgel import VisGelRecording
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.image_file import read_image
@@ -53,8 +43,8 @@ def annotate_all(
         boxes by reason.
     """
     provenance = {**models.names, **settings.as_json()}
-    annotated = LinesFile(out / ANNOTATIONS, AnnotatedTouch)
-    left_out = LinesFile(out / LEFT_OUT, LeftOutRecording)
+    annotated = records.LinesFile(out / ANNOTATIONS, records.AnnotatedTouch)
+    left_out = records.LinesFile(out / LEFT_OUT, records.LeftOutRecording)
     for file in (annotated, left_out):
         file.remove_unfinished()
     done = _finished(annotated, left_out, provenance)
@@ -62,8 +52,8 @@ def annotate_all(
     for recording in track(todo, "annotating", "recording"):
         try:
             annotated.append(annotate(recording, root, models, settings, provenance))
-        except LeftOut as reason:
-            left_out.append(LeftOutRecording(recording.name, str(reason), provenance))
+        except records.LeftOut as reason:
+            left_out.append(records.LeftOutRecording(recording.name, str(reason), provenance))
     return _summary(list(annotated.read()), list(left_out.read()))
 
 
@@ -73,30 +63,31 @@ def annotate(
     models: AnnotationModels,
     settings: AnnotationSettings,
     provenance: dict[str, Any],
-) -> AnnotatedTouch:
+) -> records.AnnotatedTouch:
     """Match the frames and the instance of one recording, and caption what is in view.
 
     LeftOut: it cannot be annotated.
     """
     touches = (_read(root / touch) for _, touch in recording.steps)
     reference_touch = root / recording.reference[1]
-    contact = match_contact(touches, _read(reference_touch), _MIN_DEFORMATION)
+    contact = matching.match_contact(touches, _read(reference_touch), _MIN_DEFORMATION)
     contact_image, touch = recording.steps[contact.index]
     video = _video_until(recording, contact_image)
     sensor = _track_sensor([root / name for name in video], models, settings)
-    chosen = match_reference(sensor)
+    chosen = matching.match_reference(sensor)
     at_contact = sensor[-1]
     assert at_contact is not None  # match_reference has checked it
     image = _read(root / video[chosen])
     detections = models.detect(image, "object")
-    kept, dropped = select_instances(detections, sensor[chosen], settings.min_score)
-    touched, overlap = match_instance(kept, at_contact, settings.min_overlap)
+    kept, dropped = matching.select_instances(detections, sensor[chosen], settings.min_score)
+    touched, overlap = matching.match_instance(kept, at_contact, settings.min_overlap)
     instances = tuple(
-        Instance(d.box, d.score, models.caption(crop(image, d.box), _CAPTION_PROMPT)) for d in kept
+        records.Instance(d.box, d.score, models.caption(crop(image, d.box), _CAPTION_PROMPT))
+        for d in kept
     )
     if not instances[touched].caption:
-        raise LeftOut("empty caption of the touched object")
-    return AnnotatedTouch(
+        raise records.LeftOut("empty caption of the touched object")
+    return records.AnnotatedTouch(
         name=recording.name,
         touch=_absolute(root / touch),
         reference_touch=_absolute(reference_touch),
@@ -106,7 +97,7 @@ def annotate(
         overlap=overlap,
         object=instances[touched].caption,
         dropped=dropped,
-        contact=Contact(
+        contact=records.Contact(
             _absolute(root / contact_image), at_contact, contact.deformation, contact.threshold
         ),
         provenance=provenance,
@@ -128,7 +119,7 @@ def _track_sensor(
         box = settings.sensor_box or _find_sensor(_read(path), models, settings)
         if box is not None:
             return [None] * first + track_csrt(map(_read, paths[first:]), box)
-    raise LeftOut("low confidence: the sensor was not detected")
+    raise records.LeftOut("low confidence: the sensor was not detected")
 
 
 def _find_sensor(
@@ -142,7 +133,7 @@ def _find_sensor(
 def _read(path: Path) -> Image:
     image = read_image(path)
     if image is None:
-        raise LeftOut("an image is missing or unreadable")
+        raise records.LeftOut("an image is missing or unreadable")
     return image
 
 
@@ -151,8 +142,8 @@ def _absolute(path: Path) -> str:
 
 
 def _finished(
-    annotated: LinesFile[AnnotatedTouch],
-    left_out: LinesFile[LeftOutRecording],
+    annotated: records.LinesFile[records.AnnotatedTouch],
+    left_out: records.LinesFile[records.LeftOutRecording],
     provenance: dict[str, Any],
 ) -> set[str]:
     """Return the names of the recordings that need not be done again."""
@@ -168,7 +159,7 @@ def _finished(
 
 
 def _summary(
-    annotated: Sequence[AnnotatedTouch], left_out: Sequence[LeftOutRecording]
+    annotated: Sequence[records.AnnotatedTouch], left_out: Sequence[records.LeftOutRecording]
 ) -> dict[str, Any]:
     dropped: Counter[str] = Counter()
     for line in annotated:

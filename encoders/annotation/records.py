@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from touchgoal.encoders.annotation.boxes import Box
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.option_types import STRICT
+from touchgoal.runtime.option_types import STRICT, first_problem
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -86,11 +86,8 @@ class LinesFile(Generic[Line]):
                 try:
                     yield self._lines.validate_json(line)
                 except ValidationError as error:
-                    first = error.errors()[0]
-                    key = ".".join(map(str, first["loc"]))
                     raise UserError(
-                        f"{self.path}:{number}: {f'{key}: ' if key else ''}{first['msg']}; mend or "
-                        "delete the line"
+                        f"{self.path}:{number}: {first_problem(error)}; mend or delete the line"
                     ) from error
 
     def remove_unfinished(self) -> None:

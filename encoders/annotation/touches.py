@@ -38,7 +38,9 @@ def annotated_touches(records: Sequence[AnnotatedTouch], sensor: str) -> Touches
     for record in track(records, "reading", "touch"):
         frames.append(_tactile(record.touch, sensor))
         backgrounds.append(_tactile(record.reference_touch, sensor))
-        views.append(_view(record))
+        if (image := read_image(Path(record.image))) is None:
+            raise UserError(f"{record.image} is missing or unreadable: annotate again")
+        views.append(square_crop(image, record.instances[record.touched].box, _VIEW))
         objects.append(record.object.lower())
         caption = record.instances[record.touched].caption
         descriptions.setdefault(objects[-1], {}).setdefault(caption)
@@ -74,10 +76,3 @@ def _tactile(path: str, sensor: str) -> UInt8[np.ndarray, "h w 3"]:
     height, width = find_model(sensor).image_shape
     frame = read_image_file(Path(path), sensor)
     return cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)
-
-
-def _view(record: AnnotatedTouch) -> UInt8[np.ndarray, "h w 3"]:
-    image = read_image(Path(record.image))
-    if image is None:
-        raise UserError(f"{record.image} is missing or unreadable: annotate again")
-    return square_crop(image, record.instances[record.touched].box, _VIEW)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 from torch import Tensor, nn
 
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
@@ -18,7 +18,8 @@ from touchgoal.encoders.backbones.tower_map import TowerMap
 from touchgoal.encoders.compiled_network import CompiledNetwork
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
-from touchgoal.encoders.towers.towers import imagenet_normalised
+from touchgoal.encoders.towers.towers import Towers, imagenet_normalised
+from touchgoal.encoders.whitening.text_head import RANK_WORDS, rank_sentences
 
 # Blocks after which the image is pooled, and channels there: edges, textures, parts. Later blocks are
 # specific to ImageNet's classes and separate touches less well.
@@ -105,6 +106,16 @@ class PooledEncoder(BaseTouchEncoder):
     def towers(self) -> str | None:
         """See BaseTouchEncoder."""
         return self.config.towers
+
+    def embed_text_goal(self, texts: list[str], towers: Towers) -> Float32[np.ndarray, "n d"]:
+        """See BaseTouchEncoder; unit vectors from the mean of the `rank_sentences` to each sentence.
+
+        Touches are centred by `mean`, so both count from an object of no particular property.
+        """
+        usual = [sentence for k in range(len(RANK_WORDS)) for sentence in rank_sentences(k)]
+        embedded = super().embed_text_goal([*texts, *usual], towers)
+        apart = embedded[: len(texts)] - embedded[len(texts) :].mean(0)
+        return apart / np.linalg.norm(apart, axis=1, keepdims=True)
 
     def project_text(self, embeddings: Float[Tensor, "n t"]) -> Float[Tensor, "n d"]:
         """See BaseTouchEncoder."""

@@ -26,18 +26,11 @@ SPARSH_BASE: dict[str, ViTConfig] = {
     "ijepa": _SQUARE_BASE,
     "vjepa": replace(_SQUARE_BASE, channels=3, tubelet=2, frames=4),
 }
-_PUBLISHED_SIZES = {"tiny": (192, 3), "small": (384, 6), "base": (768, 12)}  # width, heads
 _SIZES = {  # Our presets; widths are multiples of 6 (sine and cosine of three axes), for clips.
     "tiny": ViTConfig(patch_size=40, width=48, depth=2, heads=2, mlp_ratio=2.0),
     "compact": ViTConfig(width=144, depth=4, heads=4),
     "small": ViTConfig(),
 }
-
-
-def sparsh_vit(method: str, size: str) -> ViTConfig:
-    """Return a method's published network, as wide as ViTs of size tiny, small or base."""
-    width, heads = _PUBLISHED_SIZES[size]
-    return replace(SPARSH_BASE[method], width=width, heads=heads)
 
 
 def vit_for(method: Method, size: str, image_size: tuple[int, int]) -> ViTConfig:

@@ -11,7 +11,7 @@ import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -114,13 +114,6 @@ class _TensorUnpickler(pickle.Unpickler):
         return self._names.get((module_name, global_name), _LeftOut)
 
 
-def _pickle_of_tensors() -> ModuleType:
-    """Return a module for `pickle_module` of `torch.load`."""
-    module = ModuleType("pickle_of_tensors")
-    vars(module)["Unpickler"] = _TensorUnpickler
-    return module
-
-
 def _read(path: Path) -> Mapping[str, Any]:
     if not path.is_file():
         raise UserError(f"no such file: {path}")
@@ -131,9 +124,8 @@ def _read(path: Path) -> Mapping[str, Any]:
             scripted = any(name.endswith("constants.pkl") for name in archive.namelist())
         if scripted:
             raise UserError(f"{path} is a program of TorchScript, not weights")
-        found = torch.load(
-            path, "cpu", pickle_module=_pickle_of_tensors(), weights_only=False, mmap=True
-        )
+        pickles: Any = SimpleNamespace(__name__="pickles", Unpickler=_TensorUnpickler)
+        found = torch.load(path, "cpu", pickle_module=pickles, weights_only=False, mmap=True)
     except UserError:
         raise
     except Exception as error:  # torch.load raises whatever its parts raise

@@ -38,3 +38,9 @@ class TowerMap(nn.Module):
         """Take the mean of these embeddings as the centre."""
         unit = F.normalize(embeddings, dim=-1).flatten(0, -2)
         self.mean.copy_(unit.mean(0))
+
+    def turn(self, matrix: Float[Tensor, "d d"]) -> None:
+        """Multiply the touch embeddings, before they are brought to unit length, by a matrix."""
+        for layer in (self.linear, self.down):
+            if layer is not None:
+                layer.weight.data.copy_(matrix.T @ layer.weight)

@@ -137,7 +137,9 @@ class ViT(nn.Module):
         self.patch = _patch_projection(c)
         self.class_token = nn.Parameter(torch.zeros(1, 1, c.width)) if c.class_token else None
         self.registers = nn.Parameter(torch.empty(1, c.registers, c.width)) if c.registers else None
-        self.positions = nn.Parameter(_codes(c)[None]) if c.learned_positions else None
+        *times, rows, columns = _grid(c)
+        codes = sinusoidal_positions(rows, columns, c.width, *times)
+        self.positions = nn.Parameter(codes[None]) if c.learned_positions else None
         self.blocks = nn.ModuleList(
             Block(c.width, c.heads, c.mlp_ratio, c.norm_epsilon, c.layer_scale)
             for _ in range(c.depth)
@@ -230,11 +232,6 @@ def _grid(config: ViTConfig) -> tuple[int, ...]:
     """Return the configured tubelets in time (for clips), rows and columns."""
     times = () if config.tubelet == 1 else (config.frames // config.tubelet,)
     return (*times, *patch_grid(config))
-
-
-def _codes(config: ViTConfig) -> Float[Tensor, "n d"]:
-    *times, rows, columns = _grid(config)
-    return sinusoidal_positions(rows, columns, config.width, *times)
 
 
 def _patch_projection(config: ViTConfig) -> nn.Conv2d | nn.Conv3d:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from safetensors import SafetensorError, safe_open
 
-from touchgoal.encoders.hub.model_card import CARD, model_card
 from touchgoal.runtime.errors import UserError
 
 if TYPE_CHECKING:
@@ -183,3 +182,49 @@ def _one_line_errors(repository: str, api: "HfApi") -> Iterator[None]:
         raise UserError(
             f"cannot reach {api.endpoint} ({reason}): check the network, HF_ENDPOINT and HF_HUB_OFFLINE"
         ) from error
+
+
+CARD = "README.md"
+_TITLES = {"encoder": "Touch encoder", "policy": "Policy"}
+_PIPELINES = {"encoder": "image-feature-extraction", "policy": "robotics"}  # the Hub's names
+_USES = {
+    "encoder": "touchgoal reward-curves VIDEO --encoder {repository}",
+    "policy": "touchgoal run-policy --task {task} --policy {repository}",
+}
+
+
+def model_card(kind: str, description: dict[str, Any], repository: str) -> str:
+    """Return the card of `repository` (owner/name) as Markdown with the Hub's front matter.
+
+    `description` is the JSON beside the weights: format, config and provenance.
+    """
+    config, provenance = description["config"], description["provenance"]
+    use = _USES[kind].format(repository=repository, task=config.get("task"))
+    return f"""---
+library_name: touchgoal
+pipeline_tag: {_PIPELINES[kind]}
+tags: [touchgoal, tactile]
+---
+
+# {repository.rpartition("/")[2]}
+
+{_TITLES[kind]} for the tactile sensor `{config.get("sensor")}`, trained with touchgoal
+{provenance.get("touchgoal", "")}. Weights are safetensors; nothing in this repository is code.
+
+```
+touchgoal pull {repository}
+{use}
+```
+
+## Provenance
+
+```json
+{json.dumps(provenance, indent=2)}
+```
+
+## Configuration
+
+```json
+{json.dumps(config, indent=2)}
+```
+"""

@@ -24,9 +24,8 @@ class _UnlabelledConfig:
     lr: Positive = 1e-3
     """Highest learning rate of AdamW; it rises from 0, then falls by a cosine."""
     warmup: Annotated[float, FIXED] = 0.1  # share of the steps in which the learning rate rises
-    weight_decay: Annotated[float, FIXED] = (
-        0.04  # of weight matrices and convolutions, at the start
-    )
+    # of weight matrices and convolutions, at the start
+    weight_decay: Annotated[float, FIXED] = 0.04
     final_weight_decay: Annotated[float, FIXED] = 0.4  # reached by a cosine
 
 

@@ -8,13 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from touchgoal.encoders.backbones.vit import patch_grid
-from touchgoal.encoders.ssl.masks import (
-    draw_blocks,
-    draw_equal_counts,
-    draw_size,
-    draw_targets,
-    union_of_blocks,
-)
+from touchgoal.encoders.ssl import masks
 from touchgoal.encoders.ssl.predictor import ASPECT, JointEmbeddingPrediction, gather_tokens
 
 _SQUARE = 1.0, 1.0
@@ -33,13 +27,15 @@ class IJepa(JointEmbeddingPrediction):
         k is that of the image with the fewest; of other images some are dropped.
         """
         grid = patch_grid(self.backbone.config.vit)
-        size = draw_size(grid, _CONTEXT_SCALE, _SQUARE, generator)
-        context = union_of_blocks(draw_blocks(grid, size, count, 1, generator), grid[0] * grid[1])
-        size = draw_size(grid, _TARGET_SCALE, ASPECT, generator)
-        target, left = draw_targets(
+        size = masks.draw_size(grid, _CONTEXT_SCALE, _SQUARE, generator)
+        context = masks.union_of_blocks(
+            masks.draw_blocks(grid, size, count, 1, generator), grid[0] * grid[1]
+        )
+        size = masks.draw_size(grid, _TARGET_SCALE, ASPECT, generator)
+        target, left = masks.draw_targets(
             grid, size, count, _TARGET_BLOCKS, context, self.min_context, generator
         )
-        return {"context_ids": draw_equal_counts(left, generator), "target_ids": target}
+        return {"context_ids": masks.draw_equal_counts(left, generator), "target_ids": target}
 
     def forward(
         self, touch: Tensor, context_ids: Int[Tensor, "b k"], target_ids: Int[Tensor, "b m j"]

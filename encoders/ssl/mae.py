@@ -21,8 +21,6 @@ from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.validation import forces_line, read_forces
 from touchgoal.runtime.errors import UserError
 
-_ENCODER = "encoder"
-
 
 class MaskedAutoencoder(nn.Module):
     """Backbone, and a decoder that reconstructs hidden patches."""

@@ -5,13 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from touchgoal.encoders.ssl.frames import (
-    Recording,
-    TouchFrames,
-    find_sensor_name,
-    sample_frames,
-    sample_recordings,
-)
+from touchgoal.encoders.ssl import frames
 from touchgoal.episodes.format.remote import local_folder
 from touchgoal.episodes.importers.labelled_videos import has_labels, read_labelled_videos
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
@@ -21,7 +15,7 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import provenance
 
 Offsets = tuple[int, ...] | None
-Draw = Callable[[int, int, Offsets], TouchFrames]
+Draw = Callable[[int, int, Offsets], frames.TouchFrames]
 """Draws a number of samples from each episode or recording by a seed; see `sample_frames`."""
 
 
@@ -41,9 +35,9 @@ class _Source:
     folder: Path
     sensor: str
     episodes: EpisodeSet | None
-    recordings: Sequence[Recording] = ()
+    recordings: Sequence[frames.Recording] = ()
 
-    def chosen(self, held_out: bool) -> list[Recording]:
+    def chosen(self, held_out: bool) -> list[frames.Recording]:
         """Return the recordings for training, or those that are held out of it."""
         return [recording for recording in self.recordings if recording.held_out == held_out]
 
@@ -55,13 +49,15 @@ class _Source:
         trained, held_out = (len(self.chosen(held_out)) for held_out in (False, True))
         return {"path": path, "recordings": trained, "held_out": held_out}
 
-    def draw(self, recordings: Sequence[Recording]) -> Draw:
+    def draw(self, recordings: Sequence[frames.Recording]) -> Draw:
         """Return a function that draws from the episode set, or else from these recordings."""
         if (episodes := self.episodes) is not None:
-            return lambda count, seed, offsets: sample_frames(
+            return lambda count, seed, offsets: frames.sample_frames(
                 episodes, self.sensor, count, seed, offsets
             )
-        return lambda count, seed, offsets: sample_recordings(recordings, count, seed, offsets)
+        return lambda count, seed, offsets: frames.sample_recordings(
+            recordings, count, seed, offsets
+        )
 
 
 def open_touch(
@@ -126,7 +122,7 @@ def _open(folder: Path, sensor: str | None, keys: Mapping[str, str] | None) -> _
     folder = local_folder(folder)
     if (folder / "meta").exists():
         episodes = EpisodeSet(folder, keys=keys)
-        return _Source(folder, find_sensor_name(sensor, episodes), episodes)
+        return _Source(folder, frames.find_sensor_name(sensor, episodes), episodes)
     if labelled := has_labels(folder):
         found = read_labelled_videos(folder)
     else:
@@ -142,6 +138,6 @@ def _open(folder: Path, sensor: str | None, keys: Mapping[str, str] | None) -> _
 
 
 def _join(draws: list[Draw]) -> Draw:
-    return lambda count, seed, offsets: TouchFrames.joined(
+    return lambda count, seed, offsets: frames.TouchFrames.joined(
         [draw(count, seed, offsets) for draw in draws]
     )

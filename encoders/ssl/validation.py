@@ -10,12 +10,11 @@ from torch import Tensor
 from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.touch_backbone import BATCH
 from touchgoal.encoders.backbones.vit import patchify
-from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.self_distillation import SelfDistillation
 
 _PROBE_SAMPLES, _TOKEN_SAMPLES = 2048, 128
-_STRENGTH = 1e-3  # of the decoder's ridge
+_STRENGTH = 1e-3  # of a ridge, as a share of the number of samples
 _LEAST_SPREAD, _LEAST_RANK = 0.01, 0.05  # shares of the untrained spread, and rank above 1
 _LEAST_INFORMATION = 0.01  # nats
 
@@ -151,3 +150,23 @@ def _sample(data: TouchFrames) -> Tensor:
     """Return evenly spaced touches."""
     rows = torch.linspace(0, len(data) - 1, min(_TOKEN_SAMPLES, len(data))).long()
     return data.touch[rows]
+
+
+def ridge_r2(
+    inputs: Float[Tensor, "n d"],
+    targets: Float[Tensor, "n k"],
+    test_inputs: Float[Tensor, "m d"],
+    test_targets: Float[Tensor, "m k"],
+) -> Float[Tensor, " k"]:
+    """Return the share of each target's variance that a ridge explains on other inputs.
+
+    Columns are brought to variance 1.
+    """
+    mean, spread = inputs.mean(0), inputs.std(0).clamp(min=1e-6)
+    X, Y = ((inputs - mean) / spread).double(), targets.double()
+    offset = Y.mean(0)
+    gram = X.T @ X + _STRENGTH * len(X) * torch.eye(X.shape[1], dtype=X.dtype)
+    weights = torch.linalg.solve(gram, X.T @ (Y - offset))
+    read = ((test_inputs - mean) / spread).double() @ weights + offset
+    error = ((read - test_targets) ** 2).mean(0)
+    return (1 - error / test_targets.double().var(0, correction=0)).float()

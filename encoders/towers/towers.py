@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -42,17 +42,6 @@ class Towers(Protocol):
 
     def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
         """Return one embedding for each sentence, on the CPU, not normalised."""
-        ...
-
-
-@runtime_checkable
-class MapTowers(Towers, Protocol):
-    """Towers that also say where in an image something is."""
-
-    def embed_with_maps(
-        self, images: UInt8[np.ndarray, "n h w 3"]
-    ) -> tuple[Float[Tensor, "n d"], Float16[np.ndarray, "n c y x"]]:
-        """Return embeddings as `embed_images`, and feature maps at stride 16, by one pass."""
         ...
 
 
@@ -104,10 +93,7 @@ class OfflineTowers:
     @cached_property
     def image_weights(self) -> str:
         """Short hash of the ImageNet network's weights."""
-        digest = hashlib.sha256()
-        for weight in self.image_tower.state_dict().values():
-            digest.update(weight.cpu().numpy().tobytes())
-        return digest.hexdigest()[:12]
+        return _hash(self.image_tower.state_dict().values())
 
     @cached_property
     def text_tower(self) -> minilm.SentenceEncoder:
@@ -179,7 +165,8 @@ class ClipTowers:
         )
         self._context: int = self._model.config.text_config.max_position_embeddings
         self.image_dim = self.text_dim = int(self._model.config.projection_dim)
-        self.name = f"{source}#{_weights_hash(self._model)}"
+        projections = self._model.visual_projection.weight, self._model.text_projection.weight
+        self.name = f"{source}#{_hash(projections)}"
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
@@ -218,10 +205,8 @@ def imagenet_pixels(images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n 3 
 
 def imagenet_normalised(pixels: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n 3 y x"]:
     """Normalise pixels of 0 to 1 as for ImageNet."""
-    mean, std = (
-        torch.tensor(values, device=pixels.device)[:, None, None]
-        for values in (_IMAGENET_MEAN, _IMAGENET_STD)
-    )
+    values = torch.tensor([_IMAGENET_MEAN, _IMAGENET_STD], device=pixels.device)
+    mean, std = values[:, :, None, None]
     return (pixels - mean) / std
 
 
@@ -246,9 +231,9 @@ def _joined(batches: list[Tensor], width: int) -> Tensor:
     return torch.cat(batches) if batches else torch.empty(0, width)
 
 
-def _weights_hash(model: Any) -> str:
-    """Return 12 hex digits of a hash of both projections."""
+def _hash(weights: Iterable[Tensor]) -> str:
+    """Return 12 hex digits of a hash of weights."""
     digest = hashlib.sha256()
-    for layer in (model.visual_projection, model.text_projection):
-        digest.update(layer.weight.detach().cpu().numpy().tobytes())
+    for weight in weights:
+        digest.update(weight.detach().cpu().numpy().tobytes())
     return digest.hexdigest()[:12]

@@ -16,14 +16,9 @@ from touchgoal.runtime.errors import UserError
 _CHECKPOINT, _METRICS = "checkpoint.pt", "metrics.jsonl"
 
 
-def has_checkpoint(out_dir: Path) -> bool:
-    """Return whether a run has finished an epoch there."""
-    return (out_dir / _CHECKPOINT).is_file()
-
-
 def check_run_folder(out_dir: Path, resume: bool) -> None:
     """Raise UserError if there is nothing to resume, or a run would be overwritten."""
-    exists = has_checkpoint(out_dir)
+    exists = (out_dir / _CHECKPOINT).is_file()
     if resume and not exists:
         raise UserError(f"nothing to resume in {out_dir}: start without resuming")
     if not resume and (exists or (out_dir / _METRICS).exists()):

@@ -4,21 +4,25 @@ Loading is strict: wrong weights give numbers that look like any others.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import GenericAlias
 from typing import Any, TypeVar
 
 import torch
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import first_problem
 from touchgoal.runtime.provenance import portable
 
 FORMAT = 1
+_EXACT = ConfigDict(extra="forbid", allow_inf_nan=False)
 Config = TypeVar("Config")
 
 
@@ -78,13 +82,22 @@ class WeightsFormat:
         """Return the provenance of the training; UserError as for `read_json`."""
         return self.read_json(directory)["provenance"]
 
-    def read_config(self, directory: Path, build: Callable[[dict[str, Any]], Config]) -> Config:
-        """Return the config built from its JSON; UserError if that fails."""
+    def read_config(
+        self, directory: Path, kinds: type[Config] | Mapping[str, type[Config]]
+    ) -> Config:
+        """Return the config, of a dataclass or of that which its `kind` names.
+
+        UserError: the JSON lacks a field, or has another one.
+        """
         try:
-            return build(dict(self.read_json(directory)["config"]))
-        except (KeyError, TypeError) as error:
+            fields = dict(self.read_json(directory)["config"])
+            kind = kinds if isinstance(kinds, type) else kinds[fields.pop("kind")]
+            one: Any = GenericAlias(tuple, (kind,))  # a dataclass alone takes no config
+            return TypeAdapter(one, config=_EXACT).validate_python([fields])[0]
+        except (KeyError, TypeError, ValidationError) as error:
+            wrong = first_problem(error) if isinstance(error, ValidationError) else str(error)
             raise UserError(
-                f"{self._json_path(directory)} is damaged ({error}): {self.remedy}"
+                f"{self._json_path(directory)} is damaged ({wrong.removeprefix('0.')}): {self.remedy}"
             ) from error
 
     def load_weights(self, module: nn.Module, directory: Path) -> None:

@@ -1,19 +1,19 @@
-"""Adaptation of a whitened encoder to real videos: their covariance blended in, and sentences."""
+"""Adaptation of a whitened encoder to real videos: its centre, its covariance and its sentences."""
 
 from dataclasses import replace
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
+from touchgoal.encoders.backbones.tower_map import TowerMap
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.encoders.whitening.covariance import inverse_square_root, within_classes
 from touchgoal.encoders.whitening.text_head import fit_text_head
 from touchgoal.episodes.importers.labelled_videos import LabelledVideo, firmest_frames
-from touchgoal.episodes.touches import touch_background
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
@@ -23,35 +23,62 @@ _SHARE = 0.1
 
 
 def adapt(encoder: PooledEncoder, videos: list[LabelledVideo], towers: Towers) -> PooledEncoder:
-    """Return an adapted encoder, with a text head for these towers if some videos have ranks.
+    """Return an encoder adapted to videos; ranks in them replace its sentences.
 
     UserError: no object has two videos.
+
+    Args:
+        towers: towers whose sentences are fitted to the ranks.
     """
     objects = np.array([video.object for video in videos])
     if not videos or np.unique(objects, return_counts=True)[1].max() < 2:
         raise UserError("no object has two videos: film each object at least twice")
-    pooled = [_pooled(encoder, video) for video in track(videos, "videos", "video")]
-    every = torch.cat(pooled).double().numpy()
-    names = np.repeat(objects, [len(rows) for rows in pooled])
-    covariance = (1 - _SHARE) * encoder.covariance + _SHARE * within_classes(every, names)
-    # The maps of sentences and images were fitted to the old whitening, so they do not fit the new one.
-    plain = replace(encoder.config, towers=None, text_dim=0, text_hidden=0, image_dim=0)
-    adapted = PooledEncoder(plain).fit(every.mean(0), inverse_square_root(covariance, 0.0))
+    pooled = [pool_firmest(encoder, *video.open()) for video in track(videos, "videos", "video")]
+    adapted = centre(encoder, pooled, objects)
     ranked = [i for i, video in enumerate(videos) if video.ranks is not None]
     if not ranked:
         return adapted
     ranks = torch.tensor([videos[i].ranks for i in ranked])
-    directions = [F.normalize(adapted.whiten(pooled[i]), dim=1).mean(0) for i in ranked]
-    head = fit_text_head(torch.stack(directions), ranks, towers.embed_texts)
-    worded = PooledEncoder(replace(plain, towers=towers.name, text_dim=towers.text_dim))
-    worded.load_state_dict(adapted.state_dict(), strict=False)
-    worded.text_map = head
+    directions = torch.stack([direction(adapted, pooled[i]) for i in ranked])
+    own = {"text_dim": towers.text_dim, "text_hidden": 0, "image_dim": 0}
+    worded = PooledEncoder(replace(encoder.config, towers=towers.name, **own))
+    worded.fit(adapted.mean.numpy(), adapted.whitening.numpy())
+    worded.text_map = fit_text_head(directions, ranks, towers.embed_texts)
     return worded
 
 
-def _pooled(encoder: PooledEncoder, video: LabelledVideo) -> Float[Tensor, "k d"]:
-    """Return the features of a video's firmest frames."""
-    frames = video.frames()
-    background = touch_background(frames)
+def pool_firmest(
+    encoder: PooledEncoder,
+    frames: UInt8[np.ndarray, "n h w 3"],
+    background: UInt8[np.ndarray, "h w 3"],
+) -> Float[Tensor, "k d"]:
+    """Return the pooled features of a video's firmest frames."""
     touch = encoder.preprocess(frames[firmest_frames(frames, background)], background)
     return encoder.pool(torch.from_numpy(touch))
+
+
+def direction(encoder: PooledEncoder, pooled: Float[Tensor, "k d"]) -> Float[Tensor, " d"]:
+    """Return the mean direction of a video's touches."""
+    return F.normalize(encoder.whiten(pooled), dim=1).mean(0)
+
+
+def centre(
+    encoder: PooledEncoder, pooled: list[Float[Tensor, "k d"]], objects: Shaped[np.ndarray, " n"]
+) -> PooledEncoder:
+    """Return an encoder centred by the mean of n videos, with their covariance blended in.
+
+    Real touches lie apart from simulated ones, all to one side: about the mean of simulation each of
+    them is rough. Sentences and images move with the whitening.
+    """
+    every = torch.cat(pooled).double().numpy()
+    names = np.repeat(objects, [len(rows) for rows in pooled])
+    covariance = (1 - _SHARE) * encoder.covariance + _SHARE * within_classes(every, names)
+    whitening = inverse_square_root(covariance, 0.0)
+    centred = PooledEncoder(encoder.config)
+    centred.load_state_dict(encoder.state_dict())
+    centred.fit(every.mean(0), whitening)
+    turn = np.linalg.solve(encoder.whitening.double().numpy(), whitening)
+    for child in centred.children():
+        if isinstance(child, TowerMap):
+            child.turn(torch.from_numpy(turn).float())
+    return centred.eval()

@@ -11,8 +11,9 @@ from itertools import islice
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
+from touchgoal.control.arrays import Image
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.whitening.covariance import inverse_square_root
@@ -43,9 +44,9 @@ class WhiteningConfig:
     seed: int = 0
 
 
-def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEncoder:
-    """Return an encoder for the sensor called `name`, fitted to simulated touch."""
-    encoder = PooledEncoder(PooledEncoderConfig.for_sensor(name))
+def train(sensor: SensorModel, config: WhiteningConfig) -> PooledEncoder:
+    """Return an encoder for a sensor, fitted to simulated touch."""
+    encoder = PooledEncoder(PooledEncoderConfig.for_sensor(sensor.name))
     d = encoder.config.features
     total, square, within = np.zeros(d), np.zeros((d, d)), np.zeros((d, d))
     count, step = config.surfaces * config.presses, max(1, _BATCH // config.presses)
@@ -63,7 +64,7 @@ def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEnco
     return encoder.fit(mean, whitening)
 
 
-Press = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]
+Press = tuple[Image, Image]
 """The untouched and the pressed sensor, RGB."""
 
 
@@ -71,14 +72,16 @@ def pressed_surfaces(
     sensor: SensorModel, surfaces: int, presses: int, seed: int
 ) -> Iterator[tuple[Surface, list[Press]]]:
     """Yield random surfaces with their presses, each on another sensor instance."""
-    rng = np.random.default_rng([seed, 0])
-    units = [_unit(sensor, rng) for _ in range(_UNITS)]
+    units = sensor_units(sensor, seed)
     for i in range(surfaces):
         rng = np.random.default_rng([seed, 1, i])
         surface = random_surface(rng)
         yield (
             surface,
-            [_visible_press(surface, units[rng.integers(_UNITS)], rng) for _ in range(presses)],
+            [
+                _filmed(*visible_press(surface, units[rng.integers(_UNITS)], rng), rng)
+                for _ in range(presses)
+            ],
         )
 
 
@@ -97,30 +100,40 @@ def _pooled(
         yield rows.reshape(-1, config.presses, rows.shape[1])
 
 
+def sensor_units(sensor: SensorModel, seed: int) -> list[SensorInstance]:
+    """Return the sensor instances of a seed, their responses stronger or weaker than the file's."""
+    rng = np.random.default_rng([seed, 0])
+    return [_unit(sensor, rng) for _ in range(_UNITS)]
+
+
 def _unit(sensor: SensorModel, rng: np.random.Generator) -> SensorInstance:
-    """Return a sensor instance with a response stronger or weaker than the file's."""
     instance = sample_instance(sensor, rng)
     strength = rng.uniform(0.75, 1.3) * rng.uniform(0.85, 1.15, (3, 1, 1))
     response = (instance.calibration.response * strength).astype(np.float32)
     return replace(instance, calibration=replace(instance.calibration, response=response))
 
 
-def _visible_press(surface: Surface, unit: SensorInstance, rng: np.random.Generator) -> Press:
-    """Return the camera images of the untouched and of the pressed sensor."""
-    rest = render_untouched(unit, rng)
+def visible_press(surface: Surface, unit: SensorInstance, rng: np.random.Generator) -> Press:
+    """Return a random press that can be seen, or the last of a few."""
+    rest = unit.with_dots(render_untouched(unit, rng))
     frame = rest
     for _ in range(_TRIES):
         frame = press(surface, random_pose(rng), unit, rng)
         change = cv2.resize(frame.astype(np.float32) - rest, (40, 30), interpolation=cv2.INTER_AREA)
         if np.abs(change).max() > _VISIBLE:
             break
+    return rest, frame
+
+
+def _filmed(rest: Image, frame: Image, rng: np.random.Generator) -> Press:
+    """Return the images as recorded: at another brightness, and mostly compressed."""
     quality = int(rng.integers(*_QUALITY)) if rng.random() < _COMPRESSED else None
     gain = 1 + _COMMON_DRIFT * rng.normal() + _CHANNEL_DRIFT * rng.normal(size=3)
     lit = np.rint(frame * gain).clip(0, 255).astype(np.uint8)
     return _sent(rest, quality), _sent(lit, quality)
 
 
-def _sent(frame: UInt8[np.ndarray, "h w 3"], quality: int | None) -> UInt8[np.ndarray, "h w 3"]:
+def _sent(frame: Image, quality: int | None) -> Image:
     if quality is None:
         return frame
     data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]

@@ -11,9 +11,9 @@ from touchgoal.encoders.whitening.text_head import RANK_WORDS
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, TILE_PITCH, Surface
 
 _FINE = 1.5e-3  # m, wavelength: finer texture is roughness, coarser is bumps
-# um: thresholds between the ranks, for the standard deviation of the fine and the coarse part: a gel
-# shows 3 um of fine relief faintly, and 12 um plainly.
-_ROUGH, _BUMPY = (3.0, 12.0), (10.0, 50.0)
+# um: thresholds between the ranks, for the standard deviation of the fine and the coarse part: a
+# third of random surfaces lies below, a third above.
+_ROUGH, _BUMPY = (14.0, 28.0), (35.0, 110.0)
 
 
 def surface_sentences(surface: Surface) -> list[str]:

@@ -31,7 +31,6 @@ from touchgoal.episodes.schema import (
     Episode,
     MetaValue,
     describe_features,
-    drop_pixel_format,
     is_camera,
     is_image,
 )
@@ -200,12 +199,10 @@ def read_description(file: pq.ParquetFile) -> Description:
     if not has_description(file):
         raise UserError("this Parquet file was not written by touchgoal")
     text, footer = file.schema_arrow.metadata[_FOOTER_KEY], file.schema_arrow.metadata
-    checksum = footer.get(_CHECKSUM_KEY)  # which files of older versions lack
     try:
-        if checksum is not None and int(checksum) != zlib.crc32(text):
+        if int(footer[_CHECKSUM_KEY]) != zlib.crc32(text):
             raise ValueError("checksum")
         description = Description(**json.loads(text))
-        drop_pixel_format(description.features)
         stored = {k for k, f in description.features.items() if f["dtype"] != "video"}
         if stored != set(file.schema_arrow.names):
             raise ValueError("columns")

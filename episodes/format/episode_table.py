@@ -82,11 +82,8 @@ def _places(rows: list[Row], info: dict[str, Any]) -> list[EpisodePlace]:
     first_of: dict[str, int] = {}
     places = []
     for i, row in enumerate(rows):
-        first, length, file = (
-            row["dataset_from_index"],
-            row["length"],
-            set_files.data_path_of(row),
-        )
+        first, length = row["dataset_from_index"], row["length"]
+        file = set_files.data_path_of(row)
         if length < 1 or row["dataset_to_index"] - first != length:
             raise ValueError(f"episode {i} has a wrong length")
         videos = {}

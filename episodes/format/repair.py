@@ -32,7 +32,8 @@ def unlisted_files(root: Path, set_metadata: SetMetadata | None) -> list[str]:
     known = set(_META)
     if set_metadata:
         known |= {set_files.episodes_path(number) for number in range(len(set_metadata.files))}
-    cameras = _cameras(set_metadata.features) if set_metadata else []
+    features = set_metadata.features if set_metadata else {}
+    cameras = [key for key, feature in features.items() if feature["dtype"] == "video"]
     for file_number in _file_numbers(set_metadata):
         known |= {set_files.data_path(file_number)} | {
             set_files.video_path(k, file_number) for k in cameras
@@ -47,10 +48,6 @@ def _file_numbers(set_metadata: SetMetadata | None) -> list[int]:
     names = ["data/chunk_index", "data/file_index"]
     tables = set_metadata.files if set_metadata else ()
     return [set_files.file_number_of(row) for t in tables for row in t.select(names).to_pylist()]
-
-
-def _cameras(features: dict[str, dict[str, Any]]) -> list[str]:
-    return [key for key, feature in features.items() if feature["dtype"] == "video"]
 
 
 def _read_episode(root: Path, file_number: int) -> tuple[Description, pa.Table]:

@@ -9,7 +9,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from touchgoal.control.sensors.clip import refuse_other_format
-from touchgoal.episodes.schema import drop_pixel_format
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.json_file import parse_json
 
@@ -119,7 +118,6 @@ def load_info(root: Path) -> dict[str, Any]:
     if wrong:
         raise unreadable(root, INFO, ValueError(f"wrong {', '.join(wrong)}"))
     _check_paths(root, info)
-    drop_pixel_format(info["features"])
     return info
 
 
@@ -174,9 +172,7 @@ def unreadable(root: Path, name: str, error: Exception) -> UserError:
     return UserError(f"{root / name} is corrupt ({reason}): {repair_command(root)}")
 
 
-def last_row(table: pa.Table | None) -> Row:
-    """Return the last row of meta/episodes without statistics, or {} without a table."""
-    if table is None:
-        return {}
+def last_row(table: pa.Table) -> Row:
+    """Return the last row of meta/episodes without statistics."""
     names = [name for name in table.column_names if not name.startswith("stats/")]
     return table.select(names).slice(table.num_rows - 1).to_pylist()[0]

@@ -4,6 +4,8 @@ A folder holds `videos/` and `labels.csv` with the columns file, object, name, s
 unlabelled), hardness, roughness and bumpiness (0, 1 or 2 each; empty where not ranked).
 """
 
+import csv
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -13,7 +15,6 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from touchgoal.control.sensors.clip import read_frames
-from touchgoal.episodes.importers.tables import check_there, read_table
 from touchgoal.episodes.touches import touch_background
 from touchgoal.runtime.errors import UserError
 
@@ -94,3 +95,23 @@ def _video(folder: Path, row: dict[str, str]) -> LabelledVideo:
         ranks = int(values[0]), int(values[1]), int(values[2])
     path = folder / "videos" / row["file"]
     return LabelledVideo(path, row["object"], row["name"], row["split"], ranks)
+
+
+def read_table(table: Path, columns: Iterable[str]) -> list[dict[str, str]]:
+    """Read the rows of a CSV file; UserError if it is missing, empty or lacks a column."""
+    if not table.is_file():
+        raise UserError(f"no {table.name} in {table.parent}: give the folder as it is published")
+    with table.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        if missing := [name for name in columns if name not in (reader.fieldnames or ())]:
+            raise UserError(f"{table} lacks the column {missing[0]}")
+        rows = list(reader)
+    if not rows:
+        raise UserError(f"{table} has no rows: fetch it again")
+    return rows
+
+
+def check_there(paths: Iterable[Path], table: Path) -> None:
+    """Raise UserError for the first file that a table names and that is missing."""
+    if absent := next((path for path in paths if not path.is_file()), None):
+        raise UserError(f"{table} names {absent}, which is not there: fetch the set again")

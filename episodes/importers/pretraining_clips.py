@@ -23,12 +23,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.episodes.importers.touch_clip import (
-    TouchClip,
-    check_sensor,
-    read_image_file,
-    read_images,
-)
+from touchgoal.episodes.importers import touch_clip
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
@@ -51,18 +46,20 @@ class Recording:
 
     def frame_checksums(self) -> frozenset[int]:
         """Return checksums of the encoded images, comparable in this process."""
-        return frozenset(hash(image) for image in read_images(self.path))
+        return frozenset(hash(image) for image in touch_clip.read_images(self.path))
 
-    def open(self) -> tuple[TouchClip, UInt8[np.ndarray, "h w 3"]]:
+    def open(self) -> tuple[touch_clip.TouchClip, UInt8[np.ndarray, "h w 3"]]:
         """Read the images, and the untouched sensor.
 
         UserError: the file is damaged, or `bgs/` holds images of another size.
         """
-        clip = TouchClip(str(self.path), self.sensor, read_images(self.path), self.exchanged)
+        clip = touch_clip.TouchClip(
+            str(self.path), self.sensor, touch_clip.read_images(self.path), self.exchanged
+        )
         median = clip.median_image()
         if not self.backgrounds:
             return clip, median
-        found = [read_image_file(path, self.sensor) for path in self.backgrounds]
+        found = [touch_clip.read_image_file(path, self.sensor) for path in self.backgrounds]
         fitting = [image for image in found if image.shape == median.shape]
         if not fitting:
             raise UserError(
@@ -81,7 +78,7 @@ def read_recordings(folder: Path, sensor: str | None = None) -> list[Recording]:
         raise UserError(f"{folder} is no folder")
     slides = sorted(folder.glob("*/dataset_*.pkl"), key=_natural)
     if slides := [path for path in slides if re.fullmatch(r"dataset_\d+\.pkl", path.name)]:
-        recordings = _slides(folder, slides, check_sensor(sensor, ("digit",), folder))
+        recordings = _slides(folder, slides, touch_clip.check_sensor(sensor, ("digit",), folder))
     else:
         recordings = _gelsights(folder, sensor)
     if len(recordings) < 2:
@@ -101,9 +98,9 @@ def _gelsights(folder: Path, sensor: str | None) -> list[Recording]:
     """Hold out the shortest recordings, as Sparsh does."""
     for pattern, sensors in _LAYOUTS.items():
         if paths := sorted(p for p in folder.glob("*.pkl") if re.fullmatch(pattern, p.name)):
-            named = check_sensor(sensor, sensors, folder)
+            named = touch_clip.check_sensor(sensor, sensors, folder)
             files = track(paths, f"files of {folder.name}", "file")
-            length = {path: len(read_images(path)) for path in files}
+            length = {path: len(touch_clip.read_images(path)) for path in files}
             order = sorted(paths, key=lambda path: -length[path])
             trained = order[: min(max(round(_TRAINED * len(paths)), 1), len(paths) - 1)]
             exchanged = sensors[0] == "gelsight_markers"

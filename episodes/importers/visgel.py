@@ -92,15 +92,11 @@ def _parse(line: str, where: str, path: Path) -> tuple[Step, Step, tuple[str, ..
         raise UserError(
             f"{where} has {len(paths)} paths, not {_PATHS}: give a list of VisGel, as published"
         )
-    if _touch_first(paths[2], path):
+    # one of touch2vision: by its third path's folders, else by its name
+    kinds = [part for part in PurePosixPath(paths[2]).parts if part in _WORDS_IN_PATHS]
+    if kinds[-1] == "touch" if kinds else "touch2vision" in path.name:
         return (paths[1], paths[0]), (paths[3], paths[2]), ()
     return (paths[0], paths[1]), (paths[2], paths[3]), tuple(paths[4:])
-
-
-def _touch_first(third: str, path: Path) -> bool:
-    """Return whether a list is one of touch2vision: by its third path's folders, else by its name."""
-    kinds = [part for part in PurePosixPath(third).parts if part in _WORDS_IN_PATHS]
-    return kinds[-1] == "touch" if kinds else "touch2vision" in path.name
 
 
 def _time(path: str) -> tuple[list[int], str]:

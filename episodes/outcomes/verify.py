@@ -93,11 +93,9 @@ _CHECKS: dict[Outcome, Callable[[Truth], bool | np.bool_]] = {
     "edge_grasp": lambda t: t.held and t.success and abs(t.in_hand[-1, 0]) > _OFF_CENTRE,
     # A weak grip gives way: then the hand slides down over the object.
     "pressed": lambda t: t.held and (t.pressing.max() > _PRESSED or t.slide > _SLID),
-    "overgripped": lambda t: t.success and _within(t.grip[-1], _OVERGRIPPED),
+    "overgripped": lambda t: (
+        t.success and _OVERGRIPPED[0] < t.grip[-1].min() and t.grip[-1].max() < _OVERGRIPPED[1]
+    ),
     "wrong_object": lambda t: t.held and not t.carried and not t.success,
     "same_shape": lambda t: t.held and t.carried and t.away[-1] < _TOLERANCE and not t.success,
 }
-
-
-def _within(values: Float[np.ndarray, " k"], bounds: tuple[float, float]) -> bool:
-    return bool(((bounds[0] < values) & (values < bounds[1])).all())

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from touchgoal.control import features as ft
 from touchgoal.runtime.errors import require_all_ok
 
 if TYPE_CHECKING:
@@ -13,7 +14,6 @@ if TYPE_CHECKING:
 
 def connect(cell: "CellConfig", new_episode: bool = True) -> "CellConnection":
     """Connect to a cell or simulate it; see `connect_cell`."""
-    from touchgoal.control import features as ft
     from touchgoal.control.cell.connection import connect_cell
 
     if cell.arm == "sim":
@@ -28,7 +28,6 @@ def check_cell(cell: "CellConfig", connection: "CellConnection", episodes: Path)
 
     `episodes` is the folder that the run records into.
     """
-    from touchgoal.control import features as ft
     from touchgoal.control.cell.limits import cell_watchdogs
     from touchgoal.control.deployment.preflight import preflight
     from touchgoal.control.safety.action_filter import ActionFilter

@@ -45,7 +45,10 @@ def parse(
     description = re.sub(r"(?<=\S)\n(?=\S)", " ", description)  # tyro does so before letters alone
     short = not {"--help", "-h"}.isdisjoint(arguments)  # tyro does not accept what it hides
     typed = [_MEANT.get(a, a) for a in arguments]
-    env = envs[_task(typed, envs)] if envs else None
+    env = None
+    if envs:  # of the typed task, else the first; tyro refuses an unknown one
+        tasks = [value for value in _values(typed, "--task") if value in envs]
+        env = envs[tasks[-1] if tasks else next(iter(envs))]
     hidden_of = {name: _hidden(kind, env) for name, kind in members(config_type)}
     hidden = set().union(*hidden_of.values()) if short else set()
     registry = ConstructorRegistry()
@@ -217,12 +220,6 @@ def members(config_type: Any) -> Iterator[tuple[str, type]]:
 
 def _bare(annotation: Any) -> Any:
     return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
-
-
-def _task(arguments: Sequence[str], envs: Mapping[str, EnvConfig]) -> str:
-    """Return the typed task, else the first; tyro refuses an unknown one."""
-    typed = [value for value in _values(arguments, "--task") if value in envs]
-    return typed[-1] if typed else next(iter(envs))
 
 
 def _values(arguments: Sequence[str], option: str) -> Iterator[str]:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from touchgoal.encoders.training.batch_noise import BatchNoise
@@ -24,13 +24,6 @@ def alphas_cumprod(steps: int) -> Float[Tensor, " {steps}"]:
     t = torch.arange(steps + 1, dtype=torch.float64) / steps
     power = torch.cos((t + 0.008) / 1.008 * torch.pi / 2) ** 2
     return (1 - (1 - power[1:] / power[:-1]).clamp(max=0.999)).cumprod(0)
-
-
-def inference_timesteps(config: SamplerConfig) -> Int[Tensor, " {config.num_inference_steps}"]:
-    """Return the steps that denoising visits, from pure noise on ("trailing", Lin et al. 2024)."""
-    steps = config.num_inference_steps
-    share = torch.arange(steps, 0, -1, dtype=torch.float64) / steps
-    return (share * config.num_train_timesteps).round().long() - 1
 
 
 def add_noise(
@@ -81,7 +74,10 @@ def _denoise_flow(
 def _denoise_diffusion(
     config: SamplerConfig, network: DenoisingNetwork, x: Tensor, generator: torch.Generator
 ) -> Tensor:
-    steps = inference_timesteps(config).tolist()
+    # "trailing", from pure noise on (Lin et al. 2024)
+    count = config.num_inference_steps
+    share = torch.arange(count, 0, -1, dtype=torch.float64) / count
+    steps = ((share * config.num_train_timesteps).round().long() - 1).tolist()
     powers = alphas_cumprod(config.num_train_timesteps)[steps].tolist()
     for step, power, after in zip(steps, powers, [*powers[1:], 1.0], strict=True):
         answer = network(x, x.new_full((len(x),), step))

@@ -16,7 +16,6 @@ from touchgoal.control import features as ft
 from touchgoal.policies.actions import Normalizer
 from touchgoal.policies.config import Box, PoseEstimatorConfig
 from touchgoal.policies.heads.mlp import readout
-from touchgoal.policies.perception.keypoints import keypoints
 from touchgoal.policies.perception.target_words import WORDS_WIDTH
 
 _START = ft.FEATURES[ft.TRUTH_START].shape[0]
@@ -111,7 +110,11 @@ class PoseEstimator(nn.Module):
 
     def place_shares(self, places: Places) -> dict[str, Float[Tensor, "b 2 y x"]]:
         """Return the targets of `scores`: what each cell should hold of a place."""
-        return {key: _shares(places[key], box) for key, box in self.config.crops}
+        shares = {}
+        for key, box in self.config.crops:  # by the distance from the place; they sum to 1
+            far = (places[key][:, :, None, None] - _centres(box).to(places[key])).square().sum(-1)
+            shares[key] = (-far / _CELL**2 / 2).flatten(2).softmax(2).view_as(far)
+        return shares
 
     def scaled(
         self, images: Images, scene: Float[Tensor, "b s"], places: Places
@@ -186,13 +189,6 @@ def _centres(box: Box) -> Float[Tensor, "y x 2"]:
     return _FIRST + torch.stack(torch.meshgrid(rows, columns, indexing="ij"), -1)
 
 
-def _shares(places: Float[Tensor, "b 2 2"], box: Box) -> Float[Tensor, "b 2 y x"]:
-    """Return a share of each cell, by its distance from the place; they sum to 1."""
-    centres = _centres(box).to(places)
-    far = (places[:, :, None, None] - centres).square().sum(-1) / _CELL**2
-    return (-far / 2).flatten(2).softmax(2).view_as(far)
-
-
 def _find(
     scores: Float[Tensor, "b 2 y x"], box: Box
 ) -> tuple[Float[Tensor, "b 2 2"], Float[Tensor, "b 2"]]:
@@ -236,3 +232,19 @@ class _SpatialSoftmax(nn.Module):
         reach = (self.side - _PATCH) / 2  # px from the crop's middle to its outermost cells
         px = corner.flip(1)[:, None] + _FIRST + reach * (within + 1)
         return torch.cat([2 * px / size.flip(0) - 1, features], 2).flatten(1)
+
+
+def keypoints(
+    attention: Float[Tensor, "b k y x"], features: Float[Tensor, "b f y x"]
+) -> Float[Tensor, "b p"]:
+    """Return the place of each keypoint (x, y in [-1, 1]) and the features there, side by side.
+
+    p is k (2 + f): both coordinates and f features of each keypoint. A keypoint is the mean of all
+    cells, weighted by the softmax of its map.
+    """
+    share = attention.flatten(2).softmax(2)
+    h, w = attention.shape[2:]
+    y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
+    place = torch.stack([x, y]).flatten(1).expand(len(attention), -1, -1).to(features)
+    there = torch.cat([place, features.flatten(2)], 1)
+    return (share @ there.mT).flatten(1)

@@ -56,7 +56,10 @@ def train_pose_estimator(
             ),
             "tcp": placements.tcp[rows],
             "start": placements.start[rows, target],
-            "places": _places(placements, rows, target),
+            "places": {  # px, of the target and of the goal
+                key: torch.stack([pixels[rows, target], pixels[rows, -1]], 1)
+                for key, pixels in placements.pixels.items()
+            },
             "words": words,
             "unambiguous": unambiguous,
             "off": _PLACE_NOISE * (2 * noise.rand((len(rows), 2, 2)) - 1),
@@ -137,16 +140,6 @@ def _words(
     words = torch.zeros(len(rows), WORDS_WIDTH)
     words[~silent] = embedded[sentences[~silent]] + jitter[~silent]
     return words, alone | (sentences >= 0)
-
-
-def _places(
-    placements: Placements, rows: Int64[Tensor, " b"], target: Int64[Tensor, " b"]
-) -> dict[str, Float[Tensor, "b 2 2"]]:
-    """Return where the target and the goal are in each camera image, px."""
-    return {
-        key: torch.stack([pixels[rows, target], pixels[rows, -1]], 1)
-        for key, pixels in placements.pixels.items()
-    }
 
 
 def _add_pixel_noise(
@@ -252,10 +245,8 @@ def _errors(
     target: Int64[Tensor, " n"],
     words: Float[Tensor, "n d"],
 ) -> dict[str, Any]:
-    predicted, true = (
-        _look(estimator, placements, rows, words).start,
-        placements.start[rows, target],
-    )
+    predicted = _look(estimator, placements, rows, words).start
+    true = placements.start[rows, target]
     off = predicted - true
     away = 1e3 * off[:, :2].norm(dim=1)
     errors = {

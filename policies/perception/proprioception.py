@@ -73,10 +73,15 @@ def network_input(
     parts, start = {}, 0
     for key in columns:
         parts[key] = state[..., start : (start := start + ft.FEATURES[key].shape[0])]
-    if ft.COMMAND in parts:
-        _replace_by_command(parts)
+    if ft.COMMAND in parts:  # it replaces measured joints, velocities and TCP
+        command = parts.pop(ft.COMMAND)
+        parts[ft.STATE] = torch.cat([command, parts[ft.STATE][..., -1:]], -1)
+        if ft.TCP_POSE in parts:
+            parts[ft.TCP_POSE] = tcp_poses(command[..., : ft.N_JOINTS])
     if kind == "body_twist":
-        parts[ft.STATE] = _body_twist(parts[ft.STATE])
+        joints, velocity, width = parts[ft.STATE].split([ft.N_JOINTS, ft.N_JOINTS, 1], -1)
+        twist = (body_jacobian(joints) @ velocity[..., None])[..., 0]
+        parts[ft.STATE] = torch.cat([twist, width], -1)
         if ft.TCP_POSE in parts:
             parts[ft.TCP_POSE] = _vertical_in_body_frame(parts[ft.TCP_POSE][..., 3:])
     elif ft.TCP_POSE in parts:
@@ -89,19 +94,6 @@ def network_input(
             )
         parts[ft.TCP_POSE] = torch.cat([pose[..., :3], turned], -1)
     return torch.cat([parts[key] for key in columns if key in parts], -1)
-
-
-def _replace_by_command(parts: dict[str, Tensor]) -> None:
-    """Replace measured joints, velocities and TCP by the commanded ones."""
-    command = parts.pop(ft.COMMAND)
-    parts[ft.STATE] = torch.cat([command, parts[ft.STATE][..., -1:]], -1)
-    if ft.TCP_POSE in parts:
-        parts[ft.TCP_POSE] = tcp_poses(command[..., : ft.N_JOINTS])
-
-
-def _body_twist(state: Float[Tensor, "... 15"]) -> Float[Tensor, "... 7"]:
-    joints, velocity, width = state.split([ft.N_JOINTS, ft.N_JOINTS, 1], -1)
-    return torch.cat([(body_jacobian(joints) @ velocity[..., None])[..., 0], width], -1)
 
 
 def _vertical_in_body_frame(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 3"]:

@@ -5,7 +5,6 @@ A policy is trained on ground truth and acts on the estimates.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -134,13 +133,6 @@ class StateEstimator:
 
 def load_pose_estimator(directory: Path) -> PoseEstimator:
     """Read a pose estimator for inference; UserError: nothing there, or damaged."""
-    network = PoseEstimator(ESTIMATOR_FORMAT.read_config(directory, _config))
+    network = PoseEstimator(ESTIMATOR_FORMAT.read_config(directory, PoseEstimatorConfig))
     ESTIMATOR_FORMAT.load_weights(network, directory)
     return network
-
-
-def _config(fields: dict[str, Any]) -> PoseEstimatorConfig:
-    fields["crops"] = tuple((key, tuple(box)) for key, box in fields["crops"])
-    for name in ("size", "dilations", "sure"):
-        fields[name] = tuple(fields[name])
-    return PoseEstimatorConfig(**fields)

@@ -13,7 +13,7 @@ from touchgoal.control import features as ft
 from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_pixels
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.policies.perception.keypoints import keypoints
+from touchgoal.policies.perception.pose_estimator import keypoints
 from touchgoal.runtime.errors import UserError
 
 MAP_CHANNELS = 40  # of `EfficientNetLite0.fine_map`

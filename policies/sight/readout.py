@@ -83,11 +83,11 @@ class KeyPoseReadout(nn.Module):
     def fit(
         self,
         maps: Float16[Tensor, "n k c y x"],
-        tcp: Float[Tensor, "n 7"],
-        width: Float[Tensor, "n 1"],
+        hand: Float[Tensor, "n 8"],
         key: Float[Tensor, "n 2 8"],
     ) -> None:
-        """Fit the normalizers to training data."""
+        """Fit the normalizers to training data; `hand` is TCP pose and gripper width."""
+        tcp, width = hand.split([7, 1], 1)
         true = self._true(tcp, key)
         for k, camera in enumerate(self.cameras):
             cast(CameraReadout, camera).fit(maps[:, k], true[:, k, :, :_PLACE].flatten(0, 1))
@@ -98,33 +98,28 @@ class KeyPoseReadout(nn.Module):
     def calibrate(
         self,
         maps: Float[Tensor, "b k c y x"],
-        tcp: Float[Tensor, "b 7"],
-        width: Float[Tensor, "b 1"],
+        hand: Float[Tensor, "b 8"],
         key: Float[Tensor, "b 2 8"],
     ) -> None:
         """Scale the expected errors to the actual ones on validation episodes.
 
         A network that overfits expects too small errors (Guo et al. 2017).
         """
-        estimates, expected, _ = self.estimates(maps, tcp, width)
-        made = errors(estimates, self._true(tcp, key)) * (-expected).exp()
+        estimates, expected, _ = self.estimates(maps, hand)
+        made = errors(estimates, self._true(hand[:, :7], key)) * (-expected).exp()
         self.calibration += made.mean(0).clamp(min=1e-3).log()
 
     def forward(
-        self,
-        maps: Float[Tensor, "b k c y x"],
-        tcp: Float[Tensor, "b 7"],
-        width: Float[Tensor, "b 1"],
+        self, maps: Float[Tensor, "b k c y x"], hand: Float[Tensor, "b 8"]
     ) -> tuple[Float[Tensor, "b 2 11"], Float[Tensor, "b 2 5"]]:
         """Return the average of the cameras' estimates, in the hand's frame, and the weights of `GROUPS`.
 
         The last number of an estimate is the probability that the gripper is closed afterwards.
         """
-        estimates, expected, closed = self.estimates(maps, tcp, width)
-        frames = self._frames(tcp)
-        hand = tcp.repeat_interleave(COUNT, 0)
+        estimates, expected, closed = self.estimates(maps, hand)
+        frames, tcp = self._frames(hand[:, :7]), hand[:, :7].repeat_interleave(COUNT, 0)
         estimated = [
-            to_frame(hand, estimates[:, k].flatten(0, 1), frame.repeat_interleave(COUNT, 0))
+            to_frame(tcp, estimates[:, k].flatten(0, 1), frame.repeat_interleave(COUNT, 0))
             for k, frame in enumerate(frames)
         ]
         weights = (-2 * expected).exp()  # inverse squares of the expected errors
@@ -137,16 +132,15 @@ class KeyPoseReadout(nn.Module):
     def loss(
         self,
         maps: Float[Tensor, "b k c y x"],
-        tcp: Float[Tensor, "b 7"],
-        width: Float[Tensor, "b 1"],
+        hand: Float[Tensor, "b 8"],
         key: Float[Tensor, "b 2 8"],
     ) -> Float[Tensor, ""]:
         """Return the loss of the estimates and of their expected errors.
 
         The expected errors do not weight the estimates (Seitzer et al. 2022), so that hard images are learned.
         """
-        estimates, expected, closed = self.estimates(maps, tcp, width)
-        made = errors(estimates, self._true(tcp, key))
+        estimates, expected, closed = self.estimates(maps, hand)
+        made = errors(estimates, self._true(hand[:, :7], key))
         robust = torch.where(made < _SMALL, made.square() / 2 / _SMALL, made - _SMALL / 2)
         sureness = made.detach() * (-expected).exp() + expected
         after = F.binary_cross_entropy_with_logits(closed, key[:, None, :, 7].expand_as(closed))
@@ -155,22 +149,19 @@ class KeyPoseReadout(nn.Module):
     def error(
         self,
         maps: Float[Tensor, "b k c y x"],
-        tcp: Float[Tensor, "b 7"],
-        width: Float[Tensor, "b 1"],
+        hand: Float[Tensor, "b 8"],
         key: Float[Tensor, "b 2 8"],
     ) -> Float[Tensor, "b 2"]:
         """Return the position errors of the estimates, m."""
-        off = self(maps, tcp, width)[0][..., :-1] - _estimates_in(tcp, key)
+        off = self(maps, hand)[0][..., :-1] - _estimates_in(hand[:, :7], key)
         return off[..., :_PLACE].norm(dim=-1)
 
     def estimates(
-        self,
-        maps: Float[Tensor, "b k c y x"],
-        tcp: Float[Tensor, "b 7"],
-        width: Float[Tensor, "b 1"],
+        self, maps: Float[Tensor, "b k c y x"], hand: Float[Tensor, "b 8"]
     ) -> tuple[Float[Tensor, "b k 2 10"], Float[Tensor, "b k 2 5"], Float[Tensor, "b k 2"]]:
         """Return each camera's estimates in its frame, log expected errors, and logits of a closed gripper."""
-        height, is_open = self.height_normalizer(tcp[:, 2:3]), (width >= self.open_width).float()
+        height = self.height_normalizer(hand[:, 2:3])
+        is_open = (hand[:, 7:] >= self.open_width).float()
         state = torch.cat([height, is_open], 1)  # the width itself depends on how an object is held
         found = [camera(maps[:, k], state) for k, camera in enumerate(self.cameras)]
         estimates, expected, closed = (torch.stack(x, 1) for x in zip(*found, strict=True))

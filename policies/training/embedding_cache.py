@@ -37,7 +37,18 @@ def embed_episodes(
 
     A kill loses those in progress.
     """
-    _fill_cache(episodes, chosen, embedder, workers)
+    missing = [i for i in chosen if not _cache_path(episodes, embedder, i).exists()]
+    embed = partial(embed_episode, episodes, embedder)
+    with (
+        nullcontext(map(embed, missing))
+        if workers == 1 or not missing
+        else parallel_map(embed, missing, workers) as embedded
+    ):
+        counted = track(embedded, "embedding", "episode", total=len(missing)) if missing else ()
+        for i, rows in zip(missing, counted, strict=True):
+            path = _cache_path(episodes, embedder, i)
+            with atomic_write(path) as unfinished, unfinished.open("wb") as file:
+                np.save(file, rows)
     return [cached_embeddings(episodes, i, embedder) for i in chosen]
 
 
@@ -54,25 +65,6 @@ def cached_embeddings(
 
 def _cache_path(episodes: EpisodeSet, embedder: Embedder, i: int) -> Path:
     return embedding_file(episodes, i, embedder.name, ".npy")
-
-
-def _fill_cache(
-    episodes: EpisodeSet, chosen: Sequence[int], embedder: Embedder, workers: Workers
-) -> None:
-    missing = [i for i in chosen if not _cache_path(episodes, embedder, i).exists()]
-    if not missing:
-        return
-    embed = partial(embed_episode, episodes, embedder)
-    with (
-        nullcontext(map(embed, missing))
-        if workers == 1
-        else parallel_map(embed, missing, workers) as embedded
-    ):
-        counted = track(embedded, "embedding", "episode", total=len(missing))
-        for i, rows in zip(missing, counted, strict=True):
-            path = _cache_path(episodes, embedder, i)
-            with atomic_write(path) as unfinished, unfinished.open("wb") as file:
-                np.save(file, rows)
 
 
 def embed_episode(episodes: EpisodeSet, embedder: Embedder, i: int) -> Float16[np.ndarray, "t ..."]:

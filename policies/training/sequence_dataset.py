@@ -13,7 +13,7 @@ from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.policies.network import ObservationBatch, PolicyConfig
-from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
+from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.sight.frozen_images import ImageEmbedder
@@ -70,12 +70,15 @@ def load_recordings(
         actions.append(joint_changes(frames[ft.ACTION], frames[ft.STATE], meaning)[start:])
         if images:
             tcp.append(frames[ft.TCP_POSE][start:])
+            maps[n] = maps[n][start:]
         if config.reads_wrench:
             wrench.append(frames[ft.TRUTH_PAD_WRENCH][start:])
         no_touch = np.empty((len(actions[-1]), 0), np.float16)
         touch.append(embedded[n][start:] if embedded else no_touch)
         if config.end_to_end:
-            differences.append(_difference_images(episodes, i, config.end_to_end)[start:])
+            touched, size = episodes.read(i, ft.TACTILE).frames, config.end_to_end.size
+            sides = [difference_images(touched[k], touched[k][0], size) for k in ft.TACTILE]
+            differences.append(np.stack(sides, 1)[start:])
     parts = [torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions)]
     lengths = tuple(len(rows) for rows in actions)
     key_pose, hold = None, round(HOLD_SECONDS * config.control_hz)
@@ -87,22 +90,8 @@ def load_recordings(
         lengths=lengths,
         images=torch.from_numpy(np.concatenate(differences)) if config.end_to_end else None,
         wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
-        maps=_joined(maps, skip) if images else None,
+        maps=torch.from_numpy(np.concatenate(maps)) if images else None,
         key_pose=key_pose,
-    )
-
-
-def _joined(maps: list[np.ndarray], skip: Sequence[int] | None) -> Float16[Tensor, "n k c y x"]:
-    starts = skip or [0] * len(maps)
-    return torch.from_numpy(np.concatenate([m[s:] for m, s in zip(maps, starts, strict=True)]))
-
-
-def _difference_images(
-    episodes: EpisodeSet, i: int, end_to_end: EndToEndConfig
-) -> UInt8[np.ndarray, "t k h w 3"]:
-    frames = episodes.read(i, ft.TACTILE).frames
-    return np.stack(
-        [difference_images(frames[key], frames[key][0], end_to_end.size) for key in ft.TACTILE], 1
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import torch
 from accelerate.utils import send_to_device
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
@@ -23,6 +23,8 @@ from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
 _BETAS, _WEIGHT_DECAY = (0.95, 0.999), 1e-6  # of AdamW, as in diffusion_policy
+_SEEN = "touch", "state", "images", "maps"  # of a batch, by the policy as it acts
+_LEARNED = "actions", "noise", "wrench", "action_is_pad", "key_pose"  # and by the loss alone
 _VALIDATION_WINDOWS = 1024  # evenly spaced, for the losses
 
 
@@ -123,20 +125,9 @@ class _PolicyLoss(nn.Module):
         super().__init__()
         self.policy = policy
 
-    def forward(
-        self,
-        touch: Float[Tensor, "b o e"],
-        state: Float[Tensor, "b o s"],
-        images: Tensor | None,
-        maps: Tensor | None,
-        wrench: Float[Tensor, "b o 12"] | None,
-        actions: Float[Tensor, "b h 8"],
-        action_is_pad: Bool[Tensor, "b h"],
-        key_pose: Float[Tensor, "b 3 8"] | None,
-        noise: BatchNoise,
-    ) -> dict[str, Tensor]:
-        batch = ObservationBatch(touch, state, images, maps)
-        return {"loss": self.policy.loss(batch, actions, noise, wrench, action_is_pad, key_pose)}
+    def forward(self, **batch: Any) -> dict[str, Tensor]:
+        observed = _observed(batch)
+        return {"loss": self.policy.loss(observed, **{name: batch[name] for name in _LEARNED})}
 
 
 def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, Any]:
@@ -162,7 +153,7 @@ def _validation_batch(policy: PolicyNetwork, windows: SequenceDataset) -> dict[s
 
 
 def _observed(batch: dict[str, Any]) -> ObservationBatch:
-    return ObservationBatch(*(batch[name] for name in ("touch", "state", "images", "maps")))
+    return ObservationBatch(**{name: batch[name] for name in _SEEN})
 
 
 @torch.no_grad()
@@ -175,14 +166,7 @@ def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dic
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
     error = off.sum(1).norm(dim=1).mean()
-    loss = policy.loss(
-        observed,
-        batch["actions"],
-        BatchNoise(generator),
-        batch["wrench"],
-        is_pad,
-        batch["key_pose"],
-    )
+    loss = _PolicyLoss(policy)(**batch, noise=BatchNoise(generator))["loss"]
     metrics = {"validation_loss": loss.item(), "validation_error": error.item()}
     if batch["key_pose"] is not None:
         off = policy.key_pose_error(observed, batch["key_pose"])

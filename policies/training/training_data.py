@@ -101,7 +101,7 @@ def find_task(chosen: Sequence[tuple[EpisodeSet, Sequence[int]]], task: str | No
 
     UserError: they are of several tasks or of another one, or name none and `task` is None.
     """
-    root, found = chosen[0][0].root, _common("task", chosen, task_of)
+    root, found = chosen[0][0].root, _common("task", chosen, lambda meta: str(meta.get("task", "")))
     if task and found not in ("", task):
         raise UserError(f"{root} is of {found}, not of {task}: leave out --task")
     if not (found or task):
@@ -123,15 +123,6 @@ def succeeded(meta: Mapping[str, Any]) -> bool | None:
 def common_sensor(sets: Sequence[tuple[EpisodeSet, Sequence[int]]]) -> str:
     """Return the fingertip sensor of the episodes, "" if none is named; UserError if several."""
     return _common("sensor", sets, lambda meta: str(meta.get("sensor", "")))
-
-
-def task_of(meta: Mapping[str, Any]) -> str:
-    """Return an episode's task from its meta, which may name only the wire or the object's shape."""
-    if "task" in meta:
-        return str(meta["task"])
-    if "wire" in meta:
-        return "bead-maze"
-    return "pick-place" if "shape" in meta else ""
 
 
 def _common(what: str, sets: Sequence[tuple[EpisodeSet, Sequence[int]]], fact: Any) -> str:

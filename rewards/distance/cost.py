@@ -1,6 +1,7 @@
 """Cost of an embedded trajectory to a goal: its parts, and MMWand's plain distances (section V-E).
 
-Plain distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over the fingertips.
+Plain distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over the fingertips. The
+distance to a force goal is a share of it, 1 without contact; as the unit of its part, half of it counts.
 """
 
 from collections.abc import Mapping
@@ -11,10 +12,12 @@ from jaxtyping import Float, Float32
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.distance.parts import (
+    FORCE,
     VALUE,
     WORDS,
     Costs,
     cosine_distances,
+    force_distances,
     mean_products,
     part_costs,
     smooth_and_fuse,
@@ -32,6 +35,9 @@ from touchgoal.rewards.features.embedded import (
 from touchgoal.rewards.value import Value
 
 _ALPHA = 0.5  # share of the way to the line through baseline and sentence
+_FORCE_UNIT = (
+    0.5  # share of a force goal: without force, or with twice as much, its part costs 0.64
+)
 
 
 def compute_curves(
@@ -50,13 +56,19 @@ def compute_curves(
     """
     # normalizers were fitted on the distances of incomplete touches
     raw = plain_distances(episode.features, goal.features, completed=normalizer is None)
+    units = dict(normalizer.unit) if normalizer is not None and not plain else {}
+    if FORCE in goal.forms:
+        wanted = goal.features[FORCE]
+        newtons = float(wanted.mean())
+        raw[FORCE] = force_distances(episode.features[FORCE], wanted)[:, 0] / newtons
+        units = units and units | {FORCE: _FORCE_UNIT * newtons}
     same = goal.same_episode
     normalised: Costs = {}
     parts: Costs = {}
     if normalizer is not None:
         normalised = normalizer.normalise(raw, episode.made_with, same)
-    if normalizer is not None and normalizer.unit and not plain:
-        parts = part_costs(episode.features, goal.features, normalizer.unit)
+    if units:
+        parts = part_costs(episode.features, goal.features, units)
         if value is not None:
             parts[VALUE] = 1 - value.progress(episode.features)
         if "text" in normalised:

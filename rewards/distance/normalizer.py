@@ -18,7 +18,7 @@ from touchgoal.runtime.errors import UserError
 
 NORMALIZER = "normalizer.json"
 """Name of the file in an encoder's folder, fitted on the encoder's training episodes."""
-_FORMAT = 2
+_FORMAT = 3
 REMEDY = "fit one with touchgoal fit-normalizer, or give --normalizer none for raw distances"
 REAL_SCENE = "recorded, not simulated"
 
@@ -71,7 +71,8 @@ class DistanceNormalizer:
 
     n(d) = (d - goal) / (start - goal): 1 at the usual start, 0 at the usual end, below 0 nearer than
     that. There is one pair of medians for each `median_name`. The unit of a part of the cost
-    (`distance.parts`) is the spread of its distance among successful ends.
+    (`distance.parts`) is the spread of its distance among successful ends. A force
+    goal needs neither: see `distance.cost`.
     """
 
     start: dict[str, float]  # median raw distance of the start of a training episode to a goal
@@ -91,7 +92,7 @@ class DistanceNormalizer:
         A plain video counts as taken by the camera that the normalizer was fitted on. The goal of a
         modality in `same_episode` is a frame of the measured episode itself.
         """
-        mine, names = self.source, set(modalities)
+        mine, names = self.source, set(modalities) - {"force"}
         for m in sorted(names):
             if (name := median_name(m, m in same_episode)) not in self.start:
                 return f"it has no '{name}', only {', '.join(self.start)}"
@@ -124,7 +125,8 @@ class DistanceNormalizer:
         normalised = {}
         for m, d in raw.items():
             name = median_name(m, m in same_episode)
-            normalised[m] = (d - self.goal[name]) / (self.start[name] - self.goal[name])
+            start, end = (1.0, 0.0) if m == "force" else (self.start[name], self.goal[name])
+            normalised[m] = (d - end) / (start - end)
         return normalised
 
     def save(self, path: Path) -> None:

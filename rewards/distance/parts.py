@@ -14,7 +14,7 @@ fused cost.
     held          whether the fingertips touch
     slip          how far the contact has moved on the fingertips since the grasp (`SlipMeter`)
     wrench        force on the arm, where it is recorded: the object pressed on the table
-    force         grip force, from the depth of the gel: a line of its own, not in the fused cost
+    force         grip force, from the depth of the gel, mean over the fingertips
     words         touch against a sentence: the normalised distance, clipped to [0, 1]
     value         1 - the progress that a `Value` predicts; it does not depend on the goal
 
@@ -42,7 +42,7 @@ SMALLEST_UNIT = {
     "wrist": 1e-3,
     "wrist_map": 1e-2,
     "object": 1e-3,
-    "force": 0.05,  # log ratio
+    "force": 0.5,  # N, below which the depth of a gel reads noise
     "centre": 2e-4,  # m
     "slip": 2e-4,  # m
     "wrench": 1.0,  # N
@@ -51,7 +51,6 @@ SMALLEST_UNIT = {
 """Least unit of each part, about the noise of a camera: some demonstrations end almost alike. Other
 cameras have the one of `front`."""
 SPREAD_QUANTILE = 0.9  # of distances between ends that all succeeded: their spread
-_FORCE_FLOOR = 0.5  # N, below which the depth of a gel reads noise
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
 _SOFTNESS = 8.0  # exponent of the soft minimum
 _WRIST_MAP = "wrist_map"
@@ -63,8 +62,8 @@ def part_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndarray
     """Return the distance of each frame to each goal, for the parts that both have.
 
     Images: cosine distance, at stride 16 its mean over positions. Object: half the squared
-    distance of embeddings. Force: |log ratio| of the mean over the fingertips. Centre: m. Held: 0
-    or 1. Slip: m, whatever the goal. These are means over the fingertips. Wrench: N.
+    distance of embeddings. Force: N, of the mean over the fingertips. Centre: m. Held: 0 or 1.
+    Slip: m, whatever the goal. These are means over the fingertips. Wrench: N.
     """
     distances = {}
     for name in cameras_of(goal):
@@ -75,6 +74,8 @@ def part_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndarray
     if TOUCH in goal and "held" in goal and "held" in mine:
         distances["object"] = object_distances(mine[TOUCH], goal[TOUCH])
         distances |= contact_distances(mine, goal)
+    if FORCE in goal and FORCE in mine:
+        distances[FORCE] = force_distances(mine[FORCE], goal[FORCE])
     if "wrench" in goal and "wrench" in mine:
         force, wanted = (f["wrench"][:, :3].astype(np.float64) for f in (mine, goal))
         distances["wrench"] = np.linalg.norm(force[:, None] - wanted, axis=-1)
@@ -113,14 +114,9 @@ def mean_products(
 
 
 def contact_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndarray, "n g"]]:
-    """Return the distances of force (log ratio), centre (m), slip (m), and of being held (0 or 1)."""
+    """Return the distances of centre (m), slip (m), and of being held (0 or 1)."""
     apart = mine["held"][:, None] != goal["held"]
     distances = {"held": apart.any(-1).astype(np.float64)}
-    if FORCE in mine and FORCE in goal:
-        force, wanted = (
-            np.log(f[FORCE].astype(np.float64).mean(1) + _FORCE_FLOOR) for f in (mine, goal)
-        )
-        distances[FORCE] = np.abs(force[:, None] - wanted)
     if "centre" in mine and "centre" in goal:
         away = np.linalg.norm(mine["centre"][:, None] - goal["centre"], axis=-1)
         distances["centre"] = np.where(apart, _NO_CONTACT, away).mean(-1).astype(np.float64)
@@ -128,6 +124,13 @@ def contact_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndar
         slip = mine["slip"].astype(np.float64).mean(1)
         distances["slip"] = np.repeat(slip[:, None], len(goal["held"]), axis=1)
     return distances
+
+
+def force_distances(
+    mine: Float32[np.ndarray, "n sides"], goals: Float32[np.ndarray, "g sides"]
+) -> Float[np.ndarray, "n g"]:
+    """Return the difference of the forces, mean over the fingertips, N."""
+    return np.abs(mine.mean(1, np.float64)[:, None] - goals.mean(1, np.float64))
 
 
 def soft_minimum(distances: Float[np.ndarray, "n g"]) -> Float[np.ndarray, " n"]:
@@ -148,9 +151,10 @@ def part_costs(mine: Features, goal: Features, units: Mapping[str, float]) -> Co
             half = (UNITS_AT_HALF * max(units[name], own.get(name, 0.0))) ** 2
             square = soft_minimum(d) ** 2
             costs[name] = square / (square + half)
-    if "held" not in mine or "held" not in goal:
+    if "held" not in mine:
         return costs
-    touching, wanted = mine["held"].max(axis=1), bool(goal["held"].any())
+    touching = mine["held"].max(axis=1)
+    wanted = bool(goal["held"].any()) if "held" in goal else True  # a force is a touch
     gated = {k: gate(c, touching, wanted) for k, c in costs.items() if k in TOUCH_PARTS}
     return costs | gated
 
@@ -184,7 +188,7 @@ def smooth_and_fuse(
     """
     last = before or {}
     smoothed = {name: smooth(cost, fps, last.get(name)) for name, cost in parts.items()}
-    equal = [cost for name, cost in smoothed.items() if name not in (VALUE, FORCE)]
+    equal = [cost for name, cost in smoothed.items() if name != VALUE]
     if not equal:
         return {}
     fused = np.sqrt(np.mean(np.square(equal), axis=0))

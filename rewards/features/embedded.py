@@ -88,9 +88,8 @@ class EmbeddedGoal:
 
     features: Features
     forms: Mapping[str, str] = field(default_factory=dict)  # by modality, as a user writes them
-    same_episode: frozenset[str] = (
-        frozenset()
-    )  # modalities whose goal is the trajectory's own frame
+    # modalities whose goal is the trajectory's own frame
+    same_episode: frozenset[str] = frozenset()
 
 
 def take_rows(features: Features, rows: slice | np.ndarray) -> Features:

@@ -17,7 +17,7 @@ from touchgoal.control.tactile.background import first_steady, untouched_frames
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.pretrained import AnyTouchEncoder
-from touchgoal.encoders.towers.towers import MapTowers, OfflineTowers, Towers
+from touchgoal.encoders.towers.towers import OfflineTowers, Towers
 from touchgoal.episodes.schema import Episode, MetaValue, is_camera
 from touchgoal.episodes.touches import check_touch, touch_background
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
@@ -45,6 +45,7 @@ from touchgoal.rewards.goals import (
     GoalImage,
     Goals,
     GoalSpec,
+    GripForce,
     OwnFrame,
     Sentence,
     TouchArrays,
@@ -200,6 +201,8 @@ class EpisodeEmbedder:
             features[TEXT] = self.embed_sentences([text.text])
             if text.baseline:
                 features[TEXT_BASELINE] = self.embed_sentences([text.baseline])
+        if isinstance(force := goals.get("force"), GripForce):
+            features["force"] = np.full((1, len(own.sides)), force.newtons, np.float32)
         forms = {name: str(spec) for name, spec in goals.items()}
         return EmbeddedGoal(features, forms, same_episode(goals))
 
@@ -209,7 +212,7 @@ class EpisodeEmbedder:
             return {IMAGE: self._embed_images(frames[self.camera])} if self.camera in frames else {}
         features: dict[str, np.ndarray] = {}
         for key in dict.fromkeys((*CAMERAS, self.camera)):
-            if key in frames and isinstance(self._towers, MapTowers):
+            if key in frames and isinstance(self._towers, OfflineTowers):
                 pooled, features[map_name(key)] = self._towers.embed_with_maps(frames[key])
                 features[camera_name(key)] = _unit(pooled)
             elif key in frames:

@@ -8,16 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
-from touchgoal.rewards.features.embedded import (
-    IMAGE,
-    TOUCH,
-    EmbeddedEpisode,
-    Features,
-    last_rows,
-    load_features,
-    save_features,
-    take_rows,
-)
+from touchgoal.rewards.features import embedded
 from touchgoal.runtime.errors import UserError
 
 GOAL_FILE = "goal.npz"
@@ -29,16 +20,18 @@ _REMEDY = "write one with touchgoal fit-normalizer"
 class SuccessfulEnds:
     """Embedded last frames of successful episodes."""
 
-    features: Features  # one row per episode
+    features: embedded.Features  # one row per episode
     objects: tuple[str, ...]  # object of each; "" if unknown
     made_with: EmbeddingSource
 
     @classmethod
-    def of(cls, episodes: Sequence[EmbeddedEpisode]) -> "SuccessfulEnds":
+    def of(cls, episodes: Sequence[embedded.EmbeddedEpisode]) -> "SuccessfulEnds":
         """Take the last frame of each of some episodes that were embedded alike."""
-        return cls(last_rows(episodes), tuple(e.object for e in episodes), episodes[0].made_with)
+        return cls(
+            embedded.last_rows(episodes), tuple(e.object for e in episodes), episodes[0].made_with
+        )
 
-    def for_trajectory(self, own: EmbeddedEpisode, what: str) -> Features:
+    def for_trajectory(self, own: embedded.EmbeddedEpisode, what: str) -> embedded.Features:
         """Return the ends with the trajectory's object, all if objects are unknown here or there.
 
         The trajectory's own end is left out: it would cost 0 whatever happened. UserError, which names
@@ -58,13 +51,13 @@ class SuccessfulEnds:
         rows = np.flatnonzero(fits & ~self._ends_of(own))
         if not len(rows):
             raise UserError(f"goal '{what}' holds the end of {own.source} alone: add a success")
-        return take_rows(self.features, rows)
+        return embedded.take_rows(self.features, rows)
 
-    def _ends_of(self, own: EmbeddedEpisode) -> Bool[np.ndarray, " ends"]:
+    def _ends_of(self, own: embedded.EmbeddedEpisode) -> Bool[np.ndarray, " ends"]:
         """Return which ends are the last frame of a trajectory."""
         equal = [
             np.abs(self.features[name] - own.features[name][-1]).max(axis=-1) < _EQUAL
-            for name in (IMAGE, TOUCH)
+            for name in (embedded.IMAGE, embedded.TOUCH)
             if name in self.features and name in own.features
         ]
         return np.all([one.reshape(len(one), -1).all(axis=1) for one in equal], axis=0)
@@ -72,7 +65,7 @@ class SuccessfulEnds:
     def save(self, path: Path) -> None:
         """Write an npz file, atomically."""
         about = {"objects": self.objects, "made_with": asdict(self.made_with)}
-        save_features(path, self.features, about)
+        embedded.save_features(path, self.features, about)
 
     @classmethod
     def load(cls, path: Path) -> "SuccessfulEnds":
@@ -80,7 +73,7 @@ class SuccessfulEnds:
         if not path.is_file():
             raise UserError(f"there is no goal file {path}: {_REMEDY}")
         try:
-            features, about = load_features(path)
+            features, about = embedded.load_features(path)
             return cls(features, tuple(about["objects"]), EmbeddingSource(**about["made_with"]))
         except (ValueError, KeyError, TypeError) as error:
             raise UserError(f"{path} is no goal file: {_REMEDY}") from error

@@ -136,7 +136,7 @@ def columns_of(curves: Curves) -> dict[str, Float[np.ndarray, " n"]]:
         COST: curves.costs,
         REWARD: curves.rewards,
         POTENTIAL: curves.potential_rewards(),
-        RAW: curves.raw,
+        RAW: {m: d for m, d in curves.raw.items() if m != "force"},  # no cosine
     }
     return {
         f"{kind}{name}": values.astype(np.float64)

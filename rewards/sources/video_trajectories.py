@@ -14,17 +14,8 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
+from touchgoal.control import features as ft
 from touchgoal.control.arrays import Images
-from touchgoal.control.features import (
-    CAMERAS,
-    CONTROL_HZ,
-    FRONT,
-    IMAGE_PREFIX,
-    TACTILE,
-    TACTILE_LEFT,
-    TACTILE_RIGHT,
-    WRIST,
-)
 from touchgoal.control.sensors.clip import IMAGES, VIDEOS, Clip, in_natural_order, open_clip
 from touchgoal.control.tactile.background import SETTLES_WITHIN
 from touchgoal.episodes.schema import Episode, MetaValue
@@ -33,11 +24,11 @@ from touchgoal.rewards.sources.trajectory import Skipped, Source, Trajectory, fr
 from touchgoal.runtime.errors import UserError
 
 _ROLES = {
-    "front": FRONT,
-    "wrist": WRIST,
-    "tactile_left": TACTILE_LEFT,
-    "tactile_right": TACTILE_RIGHT,
-    "tactile": TACTILE_LEFT,
+    "front": ft.FRONT,
+    "wrist": ft.WRIST,
+    "tactile_left": ft.TACTILE_LEFT,
+    "tactile_right": ft.TACTILE_RIGHT,
+    "tactile": ft.TACTILE_LEFT,
 }
 """Last words of a file's name -> what it shows."""
 _LABELS = "labels.csv"
@@ -95,7 +86,7 @@ def open_videos(
     offset, opened = 0, list[VideoTrajectory]()
     skipped: list[Skipped] = []
     for i, (name, files) in enumerate(found.items()):
-        kept = {k: f for k, f in files.items() if with_touch or k not in TACTILE}
+        kept = {k: f for k, f in files.items() if with_touch or k not in ft.TACTILE}
         try:
             clips = _open_clips(name, kept, fps)
             untouched = _backgrounds(name, clips, apart)
@@ -103,7 +94,7 @@ def open_videos(
             skipped.append(Skipped(name, str(error)))
             continue
         first = next(iter(clips.values()))
-        rate, meta = fps or first.fps or CONTROL_HZ, labels.get(name, {})
+        rate, meta = fps or first.fps or ft.CONTROL_HZ, labels.get(name, {})
         opened.append(
             VideoTrajectory(
                 name, name, i, offset, first.length, rate, meta, clips, untouched=untouched
@@ -123,10 +114,10 @@ def open_videos(
     inputs = Inputs(
         name=shortest.source,
         camera=camera if camera in keys else None,
-        sides=tuple(key for key in TACTILE if key in keys),
+        sides=tuple(key for key in ft.TACTILE if key in keys),
         scene="a plain video",
         length=shortest.length,
-        cameras=tuple(key for key in CAMERAS if key in keys),
+        cameras=tuple(key for key in ft.CAMERAS if key in keys),
     )
     return Source(inputs, opened, skipped, _summary(path, opened))
 
@@ -191,7 +182,7 @@ def _split_name(path: Path) -> tuple[str, str]:
 
 
 def _open_clips(name: str, files: Mapping[str, Path], fps: float | None) -> dict[str, Clip]:
-    clips = {key: open_clip(files[key]) for key in (*CAMERAS, *TACTILE) if key in files}
+    clips = {key: open_clip(files[key]) for key in (*ft.CAMERAS, *ft.TACTILE) if key in files}
     if not clips:
         raise UserError(f"{name} has nothing to measure: give a camera's video")
     first = next(iter(clips.values()))
@@ -214,7 +205,7 @@ def _backgrounds(
     name: str, clips: Mapping[str, Clip], given: Sequence[Images]
 ) -> dict[str, Images]:
     """Return the untouched frames given for each fingertip; UserError if they do not fit its video."""
-    sides = [key for key in TACTILE if key in clips] if given else []
+    sides = [key for key in ft.TACTILE if key in clips] if given else []
     sizes = [clips[side].shape for side in sides]
     if (there := [frames.shape[1:3] for frames in given]) != sizes:
         raise UserError(f"{name}: --background has rows and columns {there}, its videos {sizes}")
@@ -243,7 +234,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _words(keys: Iterable[str]) -> str:
-    return ", ".join(key.removeprefix(IMAGE_PREFIX) for key in sorted(keys))
+    return ", ".join(key.removeprefix(ft.IMAGE_PREFIX) for key in sorted(keys))
 
 
 def _summary(path: Path, opened: Sequence[VideoTrajectory]) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
@@ -17,8 +17,7 @@ from touchgoal.sim_envs.cell.deployed_arm import DeployedArm
 from touchgoal.sim_envs.cell.deployment import IDEAL_DEPLOYMENT
 from touchgoal.sim_envs.cell.estimated_wrench import ForceMonitor
 from touchgoal.sim_envs.cell.hardware import SimulatedHardware
-from touchgoal.sim_envs.config import SETPOINT_PERIOD, EnvConfig
-from touchgoal.sim_envs.options import with_options
+from touchgoal.sim_envs.config import SETPOINT_PERIOD, EnvConfig, with_options
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, PadContact
 from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.tactile.pad import TactileFrame
@@ -293,17 +292,14 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
             )
 
     def _observe(self) -> Observation:
-        command = {ft.COMMAND: self._read_command()}
+        velocity = (self.command - self._command_before) * self.config.control_hz
+        command = {ft.COMMAND: np.concatenate([self.command, velocity]).astype(np.float32)}
         if self._deployed:
             observation = self._deployed.observation()
             self._force.check(observation[ft.WRENCH])  # as `deploy` does
             return observation | command
         age = {ft.AGE: np.zeros(1, np.float32)}
         return self.read_proprioception() | self.take_images() | command | age
-
-    def _read_command(self) -> Float32[np.ndarray, " c"]:
-        velocity = (self.command - self._command_before) * self.config.control_hz
-        return np.concatenate([self.command, velocity]).astype(np.float32)
 
     def observed_contacts(self) -> tuple[PadContact, PadContact]:
         """Return the pads' contacts at the time of the last observation's images."""

@@ -9,19 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control import interfaces
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.cell.limits import cell_limits
-from touchgoal.control.interfaces import (
-    STOPPED_ON_REQUEST,
-    ArmReading,
-    Camera,
-    DriverError,
-    Frame,
-    GripperReading,
-    Joints,
-    LoadReading,
-)
 from touchgoal.control.motion.tracker import Tracker, TrackerState
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.runtime.errors import UserError
@@ -66,9 +57,9 @@ class _Arm:
         self._state: TrackerState | None = None
         self._refused_because = ""
 
-    def read(self) -> ArmReading:
+    def read(self) -> interfaces.ArmReading:
         cell = self._cell
-        return ArmReading(
+        return interfaces.ArmReading(
             q=cell.q.copy(),
             velocity=cell.dq.copy(),
             wrench=cell.env.external_wrench() + cell.wrench_error,
@@ -78,9 +69,9 @@ class _Arm:
             time=cell.time,
         )
 
-    def command(self, q: Joints) -> None:
+    def command(self, q: interfaces.Joints) -> None:
         if self._refused_because:
-            raise DriverError(f"no command is taken: {self._refused_because}")
+            raise interfaces.DriverError(f"no command is taken: {self._refused_because}")
         limits = self._limits
         if not (np.isfinite(q).all() and (q >= limits.lower).all() and (q <= limits.upper).all()):
             raise UserError(f"the target {np.round(q, 3).tolist()} rad is beyond a joint's range")
@@ -91,7 +82,7 @@ class _Arm:
     def stop(self) -> None:
         self._state = None
         if not self._refused_because:
-            self._refused_because = f"{STOPPED_ON_REQUEST}; recover the arm to go on"
+            self._refused_because = f"{interfaces.STOPPED_ON_REQUEST}; recover the arm to go on"
         self._cell.brake(self._limits.acceleration)
 
     def recover(self) -> None:
@@ -116,14 +107,14 @@ class _Gripper:
         self._cell, self._force = cell, force
         self._stopped = False
 
-    def read(self) -> GripperReading:
+    def read(self) -> interfaces.GripperReading:
         env = self._cell.env
         held = min(pad.normal_force for pad in env.pad_contacts()) > _HELD_FORCE
-        return GripperReading(env.width(), held, "", self._cell.time)
+        return interfaces.GripperReading(env.width(), held, "", self._cell.time)
 
     def command(self, width: float) -> None:
         if self._stopped:
-            raise DriverError("no command is taken: the gripper was stopped")
+            raise interfaces.DriverError("no command is taken: the gripper was stopped")
         self._go(width)
 
     def stop(self, release_to: float | None = None) -> None:
@@ -147,13 +138,13 @@ class _Camera:
 
     def __init__(self, cell: SimulatedCell, name: str, rate: float) -> None:
         self._cell, self._name, self.rate, self.problem = cell, name, rate, ""
-        self._frame: Frame | None = None
+        self._frame: interfaces.Frame | None = None
 
-    def read(self) -> Frame:
+    def read(self) -> interfaces.Frame:
         now, last = self._cell.time, self._frame
         number = int((now + DT / 2) * self.rate)
         if last is None or number > last.sequence:
-            last = self._frame = Frame(self._take(), number, now)
+            last = self._frame = interfaces.Frame(self._take(), number, now)
         return last
 
     def close(self) -> None:
@@ -180,8 +171,8 @@ class _LoadCell:
     def __init__(self, cell: SimulatedCell) -> None:
         self._cell = cell
 
-    def read(self) -> LoadReading:
-        return LoadReading(self._cell.env.table_load(), 0, self._cell.time)
+    def read(self) -> interfaces.LoadReading:
+        return interfaces.LoadReading(self._cell.env.table_load(), 0, self._cell.time)
 
     def close(self) -> None:
         pass
@@ -193,7 +184,7 @@ def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
     cell = SimulatedCell(env, config.task.seed, wrench_error=True)
     env.update_contacts()
     arm = _Arm(cell, hz)
-    cameras: dict[str, Camera] = {
+    cameras: dict[str, interfaces.Camera] = {
         ft.IMAGE_PREFIX + name: _Camera(cell, name, camera.rate)
         for name, camera in config.cameras.items()
     }

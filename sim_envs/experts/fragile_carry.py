@@ -6,15 +6,7 @@ from jaxtyping import Float
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.rotations import fingers_down, rotation_vector
-from touchgoal.sim_envs.fragile_carry import (
-    GOAL,
-    GRIP_HEIGHT,
-    GRIP_OFFSET,
-    LEVEL,
-    START,
-    FragileCarry,
-    width_for,
-)
+from touchgoal.sim_envs import fragile_carry
 
 _FIRST_FORCE = 0.7  # N of each finger, too light for every rod
 _SLIP_PER_E = 2e-3  # m of slip after which the force is e times as large
@@ -35,19 +27,23 @@ class FragileCarryExpert(Actor):
     uses how far the rod has slipped, which fingertips can feel, not the force that holds.
     """
 
-    def __init__(self, env: FragileCarry) -> None:
+    def __init__(self, env: fragile_carry.FragileCarry) -> None:
         self._env = env
 
     def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
         """Return the action for the next tick; the observation is not used."""
         env = self._env
         position, R = env.kinematics.forward(env.command)
-        place = position - [START[0] + GRIP_OFFSET, START[1], LEVEL + GRIP_HEIGHT]
+        place = position - [
+            fragile_carry.START[0] + fragile_carry.GRIP_OFFSET,
+            fragile_carry.START[1],
+            fragile_carry.LEVEL + fragile_carry.GRIP_HEIGHT,
+        ]
         change = np.zeros(6)
         if min(pad.normal_force for pad in env.pad_contacts()) > _FIRST_FORCE / 2:
             turn = R @ rotation_vector(R.T @ fingers_down(0.0))
             change = np.append(_velocity(place), _RETURN * turn) / env.config.control_hz
-        width = width_for(self._force(place[2]))
+        width = fragile_carry.width_for(self._force(place[2]))
         return np.append(env.kinematics.joint_change(env.command, change), width)
 
     def _force(self, rise: float) -> float:
@@ -60,7 +56,7 @@ class FragileCarryExpert(Actor):
 
 def _velocity(place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """Return the hand's velocity (m/s) up, across and down, `place` m from where it gripped."""
-    rise, left = place[2], GOAL[1] - START[1] - place[1]
+    rise, left = place[2], fragile_carry.GOAL[1] - fragile_carry.START[1] - place[1]
     back = -_RETURN * place[0]
     if left < _OVER:
         down = min(_FAST, _LIFT + _RETURN * max(rise - 0.003, 0.0)) if rise > 0 else 0.0

@@ -43,8 +43,8 @@ class PickPlaceExpert(Actor):
 
     def _follow(self, plan: Plan) -> Iterator[np.ndarray]:
         env = self._env
-        position, _ = env.kinematics.forward(env.command)
-        yaw, target_yaw = self._yaw_now(), env.grasp_yaw(self._picked)
+        position, R = env.kinematics.forward(env.command)
+        yaw, target_yaw = float(np.arctan2(R[1, 0], R[0, 0])), env.grasp_yaw(self._picked)
         width = GRIPPER_MAX_WIDTH
         for waypoint in plan:
             ticks = round(waypoint.seconds * env.config.control_hz)
@@ -62,22 +62,14 @@ class PickPlaceExpert(Actor):
                 if waypoint.position is not None:
                     position = start + s * (waypoint.position - start)
                 yaw = start_yaw + s * (target_yaw - start_yaw)
-                yield self._towards(position, yaw, width)
+                joints = env.kinematics.solve_ik(position, fingers_down(yaw), env.command)
+                yield np.append(joints - env.command, width)
         while True:
             yield np.append(np.zeros(env.n_joints), width)
 
     def _height_in_hand(self) -> float:
         """Return the height of the object above the TCP, m."""
         return float(self._env.object_pose(self._picked)[2] - self._env.data.site("tcp").xpos[2])
-
-    def _yaw_now(self) -> float:
-        _, R = self._env.kinematics.forward(self._env.command)
-        return float(np.arctan2(R[1, 0], R[0, 0]))
-
-    def _towards(self, position: np.ndarray, yaw: float, width: float) -> np.ndarray:
-        env = self._env
-        joints = env.kinematics.solve_ik(position, fingers_down(yaw), env.command)
-        return np.append(joints - env.command, width)
 
 
 def _check(env: PickPlace, outcome: Outcome) -> None:

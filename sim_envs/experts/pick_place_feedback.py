@@ -7,12 +7,7 @@ from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
 from touchgoal.sim_envs.cell.hardware import GRIPPER_MAX_WIDTH
-from touchgoal.sim_envs.experts.pick_place_plans import (
-    CLEARANCE,
-    LOWEST_GRASP,
-    LOWEST_PLACE,
-    TOUCHDOWN_DEPTH,
-)
+from touchgoal.sim_envs.experts import pick_place_plans
 from touchgoal.sim_envs.pick_place import PickPlace
 
 _STEEP = 3.0  # m of height per m that the hand is beside its place
@@ -49,7 +44,7 @@ class FeedbackExpert(Actor):
         """Begin an episode right after its reset; by `object_error` and `goal_error` (m) it errs."""
         self._env = env
         self._object, self._yaw = env.object_pose()[:3].copy(), env.grasp_yaw()
-        self._object[2] = max(self._object[2], LOWEST_GRASP)
+        self._object[2] = max(self._object[2], pick_place_plans.LOWEST_GRASP)
         self._goal = np.array([*env.goal, self._object[2]])
         self._object += 0 if object_error is None else object_error
         self._goal += 0 if goal_error is None else goal_error
@@ -100,7 +95,9 @@ class FeedbackExpert(Actor):
         beside = float(np.linalg.norm(off[:2]))
         force = float(self._env.external_wrench()[2])
         if beside < (_PLACED if force > _NOTICEABLE else _OVER) and off[2] > -_CLOSE:
-            deepest = max(self._goal[2] - TOUCHDOWN_DEPTH, LOWEST_PLACE)
+            deepest = max(
+                self._goal[2] - pick_place_plans.TOUCHDOWN_DEPTH, pick_place_plans.LOWEST_PLACE
+            )
             lower = np.clip(1 - force / _PLACING, 0, 1) * (here[2] > deepest)
             return np.array([0, 0, -_TOUCHDOWN * lower])
         return _funnel(off, beside - _OVER, _LOWER)
@@ -116,7 +113,7 @@ def _righted(
 
 def _funnel(off: np.ndarray, beside: float, lower: float = _RETURN) -> np.ndarray:
     """Return the velocity (m/s) towards a place `off` (m) from above it."""
-    rise = off[2] + min(CLEARANCE, _STEEP * max(0.0, beside))
+    rise = off[2] + min(pick_place_plans.CLEARANCE, _STEEP * max(0.0, beside))
     distance = float(np.linalg.norm(off[:2]))
     high = np.clip(1 - rise / 0.04, 0, 1)  # over the table only where it is high enough
     climb = np.clip((_RETURN if rise > 0 else lower) * rise, -_CLIMB, _CLIMB)

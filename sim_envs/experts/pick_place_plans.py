@@ -95,11 +95,6 @@ def _pick_and_place(
     return plan
 
 
-def _never_touch(env: PickPlace) -> Plan:
-    # Closed on air the pads would touch each other, which would count as touch.
-    return _pick_and_place(env, grasp_shift=(0, 0, 0.08), closed=0.03)
-
-
 def _drop(env: PickPlace) -> Plan:
     plan = _pick_and_place(env)
     opened = [replace(waypoint, width=GRIPPER_MAX_WIDTH) for waypoint in _from(plan, "arrive")]
@@ -115,10 +110,6 @@ def _freeze(env: PickPlace, first: str, end: str) -> Plan:
     k = int(np.searchsorted(ends, time))
     share = 1 - (ends[k] - time) / moves[k].seconds
     return [*begun, *moves[:k], replace(moves[k], share=float(share))]
-
-
-def _never_lifted(env: PickPlace) -> Plan:
-    return _before(_pick_and_place(env), "lift")
 
 
 def _off(env: PickPlace) -> Plan:
@@ -154,10 +145,6 @@ def _pressed(env: PickPlace) -> Plan:
     return [*_before(plan, "touch down"), press, *_from(plan, "hold")]
 
 
-def _overgripped(env: PickPlace) -> Plan:
-    return [replace(waypoint, force=_OVERGRIP) for waypoint in _pick_and_place(env)]
-
-
 def _slip(env: PickPlace) -> Plan:
     plan, firm = _pick_and_place(env), env.grasp_force
     body = env.bodies[0]
@@ -168,10 +155,6 @@ def _slip(env: PickPlace) -> Plan:
     # From a firm grip straight to a loose one the gels would spring back and throw the object.
     relax = replace(loosen, name="relax", until="arrived", seconds=0.3, force=min(firm, 4 * holds))
     return [*_before(plan, "arrive"), relax, loosen, *rest]
-
-
-def _slow(env: PickPlace) -> Plan:
-    return [replace(waypoint, seconds=2 * waypoint.seconds) for waypoint in _pick_and_place(env)]
 
 
 def _regrasped(env: PickPlace) -> Plan:
@@ -192,10 +175,11 @@ def _regrasped(env: PickPlace) -> Plan:
 
 _PLANS: dict[Outcome, Callable[[PickPlace], Plan]] = {
     "success": _pick_and_place,
-    "slow": _slow,
+    "slow": lambda env: [replace(w, seconds=2 * w.seconds) for w in _pick_and_place(env)],
     "regrasped": _regrasped,
-    "never_touch": _never_touch,
-    "never_lifted": _never_lifted,
+    # Closed on air the pads would touch each other, which would count as touch.
+    "never_touch": partial(_pick_and_place, grasp_shift=(0, 0, 0.08), closed=0.03),
+    "never_lifted": lambda env: _before(_pick_and_place(env), "lift"),
     "freeze": partial(_freeze, first="approach", end="close"),
     "freeze_holding": partial(_freeze, first="carry", end="lower"),
     "drop": _drop,
@@ -204,7 +188,7 @@ _PLANS: dict[Outcome, Callable[[PickPlace], Plan]] = {
     "slip": _slip,
     "edge_grasp": _edge_grasp,
     "pressed": _pressed,
-    "overgripped": _overgripped,
+    "overgripped": lambda env: [replace(w, force=_OVERGRIP) for w in _pick_and_place(env)],
     "wrong_object": partial(_pick_and_place, body=picked_body("wrong_object")),
     "same_shape": _pick_and_place,  # the scene holds another object than the one asked for
 }

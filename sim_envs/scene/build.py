@@ -10,14 +10,14 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from jaxtyping import Float, Int
 
 from touchgoal.control.motion.tool import FRANKA_HAND, SENSOR_BELOW_CARRIAGE, Tool
 from touchgoal.control.motion.tracker import SERVO_DAMPING
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.config import MAX_CAMERA_SIDE, CameraPlacement, SceneConfig
-from touchgoal.sim_envs.scene.merged_corners import merge_corners
+from touchgoal.sim_envs.config import MAX_CAMERA_SIDE, SceneConfig
 from touchgoal.sim_envs.scene.objects import FIRM, Body
 
 SIDES = ("left", "right")
@@ -54,7 +54,10 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
     _add_cameras_and_table(spec, ROBOTS[config.arm].tool)
     for name, placement in (("front", config.front_camera), ("wrist", config.wrist_camera)):
         if placement is not None:
-            _place_camera(spec.camera(name), placement)
+            camera, (*pos, w, x, y, z, fovy) = spec.camera(name), placement
+            camera.pos, camera.fovy = np.array(pos), fovy
+            # Half a turn about x: MuJoCo's cameras look along -z and have y up.
+            camera.quat = np.array([-x, w, z, -y])
     for body in bodies:
         add_body(spec, body)
     return spec
@@ -280,13 +283,6 @@ def _add_cameras_and_table(spec: mujoco.MjSpec, tool: Tool) -> None:
     )
 
 
-def _place_camera(camera: mujoco.MjsCamera, placement: CameraPlacement) -> None:
-    *pos, w, x, y, z, fovy = placement
-    camera.pos, camera.fovy = np.array(pos), fovy
-    # Half a turn about x: MuJoCo's cameras look along -z and have y up.
-    camera.quat = np.array([-x, w, z, -y])
-
-
 _GEOM_TYPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -341,3 +337,48 @@ def look_at(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) 
     x = np.cross(up, z)
     x = x / np.linalg.norm(x)
     return _quaternion(x, np.cross(z, x), z)
+
+
+_FEWEST = 100  # triangles; a mesh that would have fewer stays as it is
+
+
+def merge_corners(spec: mujoco.MjSpec, names: set[str], size: float) -> None:
+    """Merge the corners of named meshes that lie in one cube of `size` m (Rossignac, Borrel 1993).
+
+    In software OpenGL, most of an image's time goes to triangles smaller than a pixel.
+    """
+    model = spec.copy().compile()
+    for mesh in [m for m in spec.meshes if m.name in names]:
+        vertices, faces = _merged(*_read(model, model.mesh(mesh.name).id), size)
+        if len(faces) >= _FEWEST:
+            mesh.file = ""
+            mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX  # it need not be closed
+
+
+def _read(
+    model: mujoco.MjModel, mesh: int
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
+    """Return a mesh as its file has it, m: compiled, it lies about its centre of mass."""
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    vertices = model.mesh_vert[first : first + count].astype(float)
+    first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+    R = np.empty(9)
+    mujoco.mju_quat2Mat(R, model.mesh_quat[mesh])
+    faces = model.mesh_face[first : first + count]
+    return vertices @ R.reshape(3, 3).T + model.mesh_pos[mesh], faces
+
+
+def _merged(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], size: float
+) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, "l 3"]]:
+    cubes, cube = np.unique(np.floor(vertices / size), axis=0, return_inverse=True)
+    means = np.zeros_like(cubes)
+    np.add.at(means, cube.ravel(), vertices)
+    means /= np.bincount(cube.ravel())[:, None]
+    corners = cube.ravel()[faces]
+    ordered = np.sort(corners, axis=1)
+    _, first = np.unique(ordered, axis=0, return_index=True)
+    kept = first[(np.diff(ordered[first], axis=1) > 0).all(1)]  # neither twice nor without an area
+    used, corner = np.unique(corners[kept], return_inverse=True)
+    return means[used], corner.reshape(-1, 3).astype(np.int32)

@@ -44,6 +44,11 @@ class Material:
     friction: float  # sliding friction coefficient against gel and table
     rgba: tuple[float, float, float, float]  # colour
 
+    @property
+    def is_textured(self) -> bool:
+        """Whether the surface has a pattern that a gel can show."""
+        return bool(self.texture and self.amplitude)
+
 
 HARD, FIRM, SOFT = 1e11, 6e8, 1.2e8  # Pa/m: far stiffer than the gel, twice as stiff, softer
 

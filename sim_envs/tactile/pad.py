@@ -24,9 +24,10 @@ from touchgoal.sim_envs.tactile.shear_relief import ShearRelief
 from touchgoal.sim_envs.tactile.texture import add_texture
 
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
-# Surfaces at half the image's resolution: between two of its rays a 20 mm ball deviates from a
-# straight line by 0.09 um. The force balance, over the whole gel, needs a quarter.
-_FINE, _COARSE = 2, 4
+# Bodies are computed at half the image's resolution: between two of its rays a 20 mm ball deviates
+# from a straight line by 0.09 um. Textures need the image's own, the force balance, over the whole
+# gel, a quarter.
+_TEXTURED, _SMOOTH, _COARSE = 1, 2, 4
 AddGeom = Callable[[HeightField, float], None]  # raises a height field of a pitch (m) to a geom
 
 
@@ -35,7 +36,8 @@ class TactileFrame:
     """One sensor reading."""
 
     image: UInt8[np.ndarray, "h w 3"]  # camera image, RGB
-    surface: Float32[np.ndarray, "h2 w2"]  # depth below rest at half the image's resolution, m
+    # depth below rest, m, at the image's resolution or, under smooth bodies, at half of it
+    surface: Float32[np.ndarray, "h2 w2"]
     overlap: Float32[np.ndarray, "h2 w2"]  # the object's depth in the undeformed gel, m; 0 beside
     field: ForceField | None  # forces over the whole gel; None where nothing touches
 
@@ -82,7 +84,7 @@ class TactilePad:
         }
         rows, columns = sensor.image_shape
         pitch = instance.pixel_pitch
-        self._image_grid = Grid(rows // _FINE, columns // _FINE, pitch * _FINE)
+        self._grids = {k: Grid(rows // k, columns // k, k * pitch) for k in (_TEXTURED, _SMOOTH)}
         # Over the whole gel; its sizes are multiples of four.
         gel_columns, gel_rows = (4 * round(size / pitch / _COARSE / 4) for size in sensor.gel_size)
         self._gel_grid = Grid(gel_rows, gel_columns, pitch * _COARSE)
@@ -91,7 +93,7 @@ class TactilePad:
         if len(instance.markers):
             points = (instance.markers - np.array([columns - 1, rows - 1]) / 2) * pitch
             self._motion = GelMotion(sensor, self._gel_grid, points)
-        self._relief = ShearRelief(sensor, self._gel_grid, self._image_grid) if relief else None
+        self._relief = ShearRelief(sensor, self._gel_grid) if relief else None
 
     def sense(
         self, data: mujoco.MjData, contact: PadContact, rng: np.random.Generator
@@ -102,14 +104,19 @@ class TactilePad:
             return self._untouched(rng)
         placed = [self._placed(data, body) for body in touched]
         press = self._press(placed, contact, touched)
-        overlaps = (self._overlap(data, press, *body) for body in zip(touched, placed, strict=True))
+        textured = any(self._materials[body].is_textured for body in touched)
+        grid = self._grids[_TEXTURED if textured else _SMOOTH]
+        bodies = zip(touched, placed, strict=True)
+        overlaps = (self._overlap(data, press, grid, *body) for body in bodies)
         overlap = reduce(np.maximum, overlaps)
         # The solver's coefficient: the object's, which has priority over the gel's.
         friction = max(float(self._model.geom_friction[geom, 0]) for geom in contact.geoms)
         self._field = force_field(press, self._field, contact, friction, self._sensor)
-        surface = deform(overlap, self._image_grid.pitch, self._instance.calibration.blur_sigmas)
+        surface = deform(overlap, grid.pitch, self._instance.calibration.blur_sigmas)
+        if not textured:
+            surface = cv2.GaussianBlur(surface, (3, 3), 0)  # it is doubled: no creases
         if self._relief is not None:
-            surface += self._relief(self._field, overlap)
+            surface += self._relief(self._field, overlap, grid)
         image = render(surface, self._instance, rng)
         if self._motion is not None:
             moved = self._motion(self._field) / np.float32(self._instance.pixel_pitch)
@@ -119,7 +126,7 @@ class TactilePad:
     def _untouched(self, rng: np.random.Generator) -> TactileFrame:
         self._field = None
         image = self._instance.with_dots(render_untouched(self._instance, rng))
-        flat = np.zeros((self._image_grid.rows, self._image_grid.columns), np.float32)
+        flat = np.zeros((self._grids[_SMOOTH].rows, self._grids[_SMOOTH].columns), np.float32)
         return TactileFrame(image, flat, flat, None)
 
     def _touched(self, contact: PadContact) -> list[int]:
@@ -136,11 +143,13 @@ class TactilePad:
         return press_until_balanced(height, self._gel_grid.pitch, contact, modulus, self._sensor)
 
     def _overlap(
-        self, data: mujoco.MjData, press: Press, body: int, geoms: list[AddGeom]
+        self, data: mujoco.MjData, press: Press, grid: Grid, body: int, geoms: list[AddGeom]
     ) -> HeightField:
-        grid, material = self._image_grid, self._materials[body]
-        height = _height(geoms, grid)
-        press.push_in(height, grid.pitch)
+        material, coarse = self._materials[body], self._grids[_SMOOTH]
+        height = _height(geoms, coarse)
+        press.push_in(height, coarse.pitch)
+        if grid is not coarse:
+            height = cv2.resize(height, (grid.columns, grid.rows), interpolation=cv2.INTER_LINEAR)
         position, rotation = self._pose(data, data.xpos[body], data.xmat[body])
         add_texture(height, grid.pitch, material, position - [0, 0, press.shift], rotation)
         cv2.threshold(height, 0, 0, cv2.THRESH_TOZERO, dst=height)

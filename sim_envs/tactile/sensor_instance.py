@@ -37,6 +37,7 @@ class SensorInstance:
     noise: Int8[np.ndarray, "3 h2 w2"]
     markers: Float32[np.ndarray, "n 2"]  # resting dots (x, y), px; none on a plain gel
     marker_radius: float  # px
+    defocus: float = 0.0  # standard deviation of the camera's blur by its lens, px
 
     @property
     def pixel_pitch(self) -> float:
@@ -84,6 +85,7 @@ def sample_instance(
     noise = np.empty((3, *tile), np.int8)
     _mix(shared, own, typical.noise / COUNT_STEP, noise)
     markers, radius = _markers(sensor, pitch, randomization.markers, rng)
+    blurred = sensor.defocus * randomization.defocus
     return SensorInstance(
         calibration,
         background,
@@ -91,6 +93,7 @@ def sample_instance(
         noise,
         markers,
         radius,
+        rng.uniform(0, blurred) if blurred else 0.0,
     )
 
 

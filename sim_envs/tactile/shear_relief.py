@@ -19,10 +19,9 @@ _RIM = 0.3e-3  # m: how softly the relief ends where an object holds the surface
 class ShearRelief:
     """Depth that a contact's shear, scaled as in `markers.GelMotion`, adds to a gel's surface."""
 
-    def __init__(self, sensor: SensorModel, gel: Grid, image: Grid) -> None:
-        """Prepare for forces on the gel's cells, two by two of `gel`, and surfaces on `image`."""
+    def __init__(self, sensor: SensorModel, gel: Grid) -> None:
+        """Prepare for forces on the gel's cells, two by two of `gel`."""
         self._stiffness, self._pitch = sensor.shear_stiffness, 2 * gel.pitch
-        self._image = image
         size = 2.2 * max(sensor.gel_size)  # m, padded: the Fourier transform wraps around
         self._n = 1 << int(np.ceil(np.log2(size / self._pitch)))
         self._kx = 2 * np.pi * np.fft.rfftfreq(self._n, self._pitch)[None]
@@ -33,15 +32,15 @@ class ShearRelief:
         self._give = across + (along - across) * (share / np.maximum(wave, 1e-3)) ** 2
 
     def __call__(
-        self, field: ForceField, overlap: Float32[np.ndarray, "h w"]
+        self, field: ForceField, overlap: Float32[np.ndarray, "h w"], image: Grid
     ) -> Float32[np.ndarray, "h w"]:
         """Return the depth (m) to add to the surface; none where the object itself holds it.
 
-        `overlap`: object's overlap with the undeformed gel, on the image's grid.
+        `overlap`: object's overlap with the undeformed gel, on the grid `image`.
         """
-        relief = resample_to_image(self.depth(field), field, self._image)
+        relief = resample_to_image(self.depth(field), field, image)
         free = (overlap <= 0).astype(np.float32)
-        return relief * cv2.GaussianBlur(free, (0, 0), _RIM / self._image.pitch)
+        return relief * cv2.GaussianBlur(free, (0, 0), _RIM / image.pitch)
 
     def depth(self, field: ForceField) -> Float[np.ndarray, "h w"]:
         """Return the depth (m) of the surface under the shear alone, on the field's cells."""

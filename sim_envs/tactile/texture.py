@@ -137,7 +137,7 @@ def add_texture(
     shape; the others are tiles, projected along the object's axis that faces the gel most.
     `position`, `rotation`: pose of the object in the sensor frame.
     """
-    if not material.texture or not material.amplitude:
+    if not material.is_textured:
         return
     scalars = -2 * material.amplitude, pitch
     below, step = (np.float32(a) for a in scalars)

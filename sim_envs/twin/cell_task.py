@@ -6,12 +6,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CameraSection, CellConfig
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import OptionError
-from touchgoal.sim_envs.config import (
-    BeadMazeConfig,
-    CameraPlacement,
-    PickPlaceConfig,
-    TaskConfig,
-)
+from touchgoal.sim_envs.config import BeadMazeConfig, CameraPlacement, PickPlaceConfig, TaskConfig
 
 
 def env_config_of(config: CellConfig) -> TaskConfig:

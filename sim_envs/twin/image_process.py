@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from touchgoal.control import features as ft
+from touchgoal.control.sensors.live_image import StreamServer
 from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
 from touchgoal.sim_envs.tactile.pad import TactilePad
-from touchgoal.sim_envs.twin.mjpeg import Stream, StreamServer
+from touchgoal.sim_envs.twin.mjpeg import Stream
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # everything that an image depends on
 _CAMERA_NOISE = 1.5  # counts: lets a driver tell a still scene from a frozen camera

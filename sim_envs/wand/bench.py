@@ -67,8 +67,8 @@ class Bench:
     @property
     def centre(self) -> Float[np.ndarray, "3"]:
         """Middle of the object, m, world frame."""
-        turn = self.data.mocap_quat[self._object]
-        return self.data.mocap_pos[self._object] + _rotation(turn) @ self._centre
+        turn = Rotation.from_quat(self.data.mocap_quat[self._object], scalar_first=True)
+        return self.data.mocap_pos[self._object] + turn.as_matrix() @ self._centre
 
     def place_object(self, x: float, y: float, yaw: float) -> None:
         """Put the object on the bench, m and rad."""
@@ -262,7 +262,3 @@ def _bounds(
     low, high = (places - reach[:, None]).min(0), (places + reach[:, None]).max(0)
     centre = (low + high) / 2
     return centre, float((np.linalg.norm(places - centre, axis=1) + reach).max())
-
-
-def _rotation(quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    return Rotation.from_quat(quat, scalar_first=True).as_matrix()

@@ -61,7 +61,10 @@ class WandObject:
 def wand_objects() -> dict[str, WandObject]:
     """Return the catalogue, in the paper's order."""
     entries = tomllib.loads(Path(__file__).with_name("objects.toml").read_text())
-    return {name: _read(name, entry) for name, entry in entries.items()}
+    return {
+        name: WandObject(name, e["number"], e["mass"] * 1e-3, tuple(e["descriptions"]), e)
+        for name, e in entries.items()
+    }
 
 
 def find_wand_object(name: str) -> WandObject:
@@ -69,11 +72,6 @@ def find_wand_object(name: str) -> WandObject:
     if name not in wand_objects():
         raise unknown_name("object", name, wand_objects())
     return wand_objects()[name]
-
-
-def _read(name: str, entry: dict[str, Any]) -> WandObject:
-    mass, descriptions = entry["mass"] * 1e-3, tuple(entry["descriptions"])
-    return WandObject(name, entry["number"], mass, descriptions, entry)
 
 
 def _parts(entry: dict[str, Any], rng: np.random.Generator) -> list[Part]:

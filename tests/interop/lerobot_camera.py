@@ -15,9 +15,10 @@ from lerobot.cameras import make_cameras_from_configs
 from lerobot.robots.so_follower import SO101FollowerConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from touchgoal.control.sensors.live_image import StreamServer
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
-from touchgoal.sim_envs.twin.mjpeg import Stream, StreamServer
+from touchgoal.sim_envs.twin.mjpeg import Stream
 
 CELL = """
 arm = "sim"

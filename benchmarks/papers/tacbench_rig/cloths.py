@@ -64,7 +64,7 @@ def press_cloth(config: RigConfig, index: int) -> ClothClip:
             (float(on_cloth[0]), float(on_cloth[1])),
             float(depth),
         )
-        frames.append(unit.with_dots(press(surface, pose, unit, rng)))
+        frames.append(press(surface, pose, unit, rng))
     return ClothClip(np.stack(frames), number)
 
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.runtime.option_types import RARE, PositiveRange, Seed, checked_dataclass
+from touchgoal.runtime.option_types import ORDERED, RARE, Positive, Seed, checked_dataclass
 from touchgoal.sim_envs.object_slides import LOAD
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
@@ -21,7 +21,7 @@ class RigConfig:
     """Fingertip sensor: a name or the folder of a sensor file."""
     indenters: tuple[Indenter, ...] = ("sphere", "sharp", "flat")
     """Probes, used in turn."""
-    load: Annotated[PositiveRange, RARE] = LOAD
+    load: Annotated[tuple[Positive, Positive], ORDERED, RARE] = LOAD
     """Range of the normal load, N."""
     shear_relief: bool = True
     """Simulate that the gel piles up in front of what slides over it and sinks behind: the only

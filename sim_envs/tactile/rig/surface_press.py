@@ -17,6 +17,7 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 
 DEPTHS = 0.15e-3, 1.3e-3  # range of the indentation by a light hand, m
 _NOTHING = -5e-3  # m: far below the gel
+_CARRYING = 0.6e-6  # m2 of a surface's highest points that carry a press
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,8 @@ def overlap(
         surface.texture, to_cells, (w, h), flags=flags, borderMode=cv2.BORDER_WRAP
     )
     # The highest points, not the one highest: a single grain does not carry the press.
-    top = float(np.partition(height.ravel(), -40)[-40])
+    carrying = min(round(_CARRYING / pitch**2), height.size)
+    top = float(np.partition(height.ravel(), -carrying)[-carrying])
     height += np.float32(pose.depth - top)
     return np.maximum(height, 0) * np.float32(surface.firmness)
 
@@ -92,8 +94,9 @@ def _body(surface: Surface, x: np.ndarray, y: np.ndarray) -> Float32[np.ndarray,
 def press(
     surface: Surface, pose: SurfacePose, instance: SensorInstance, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Render one sensor's image of a press, RGB."""
+    """Render one sensor's image of a press, RGB; without shear its dots hardly move."""
     _, h, w = instance.background.shape
-    pitch = 2 * instance.pixel_pitch  # surfaces are at half the image's resolution
-    raw = overlap(surface, pose, (h // 2, w // 2), pitch)
-    return render(deform(raw, pitch, instance.calibration.blur_sigmas), instance, rng)
+    pitch = instance.pixel_pitch
+    raw = overlap(surface, pose, (h, w), pitch)
+    deformed = deform(raw, pitch, instance.calibration.blur_sigmas)
+    return instance.with_dots(render(deformed, instance, rng))

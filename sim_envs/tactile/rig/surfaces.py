@@ -12,12 +12,24 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-TILE = 256  # cells along a texture's side
-TILE_PITCH = 0.1e-3  # m per cell of a texture: a tile shows 25.6 mm
+TILE = 512  # cells along a texture's side
+TILE_PITCH = 0.05e-3  # m per cell of a texture, less than a pixel: a tile shows 25.6 mm
 
-Tile = Float32[np.ndarray, "256 256"]
+Tile = Float32[np.ndarray, "512 512"]
 Body = Literal["flat", "ball", "cylinder", "edge", "bar", "corner"]
 BODIES: tuple[Body, ...] = ("flat", "ball", "cylinder", "edge", "bar", "corner")
+
+
+# The body's shares in the order of `BODIES`, and its sizes, m.
+_SHARES, _SIZES = (0.38, 0.26, 0.12, 0.09, 0.09, 0.06), (2.5e-3, 60e-3)
+# Textures are drawn by their slope: a gel follows a wave of height a and length l only under a
+# pressure that grows as a / l (Johnson, Contact Mechanics, 13.2), so under one hand the slope is
+# limited, not the height. These ranges (m per m) and shares were chosen so that simulated presses
+# have the spectrum of real ones (`python -m benchmarks touch-spectrum`).
+_GRAIN, _SLOPES = (0.09, 0.28), (0.14, 0.7)
+_LAYERS = (0.15, 0.45, 0.4)  # shares of surfaces with none, one and two patterns on their grain
+_HIGHEST = 0.8e-3  # m: a coarse pattern needs not be steep
+_COAT = 2.0  # cells: the gel's coat and the camera blur what is finer
 
 
 @dataclass(frozen=True)
@@ -33,21 +45,30 @@ class Surface:
 
 def random_surface(rng: np.random.Generator) -> Surface:
     """Draw a surface."""
-    texture = np.zeros((TILE, TILE), np.float32)
-    for _ in range(int(rng.choice([0, 1, 2], p=[0.08, 0.5, 0.42]))):
-        amplitude = _log_uniform(rng, 8e-6, 6e-4)
-        texture += np.float32(amplitude) * _unit(_PATTERNS[rng.integers(len(_PATTERNS))](rng))
+    texture = _steep(_grain(rng), _log_uniform(rng, *_GRAIN))
+    for _ in range(int(rng.choice([0, 1, 2], p=_LAYERS))):
+        pattern = _PATTERNS[rng.integers(len(_PATTERNS))](rng)
+        texture += _steep(pattern, _log_uniform(rng, *_SLOPES))
+    texture = cv2.GaussianBlur(np.pad(texture, 8, mode="wrap"), (0, 0), _COAT)[8:-8, 8:-8]
     return Surface(
-        body=BODIES[rng.choice(len(BODIES), p=[0.3, 0.34, 0.17, 0.07, 0.08, 0.04])],
-        size=_log_uniform(rng, 1.5e-3, 40e-3),
+        body=BODIES[rng.choice(len(BODIES), p=_SHARES)],
+        size=_log_uniform(rng, *_SIZES),
         slope=_log_uniform(rng, 0.1, 2.0),
-        texture=texture,
+        texture=np.ascontiguousarray(texture),
         firmness=float(rng.choice([1.0, rng.uniform(0.15, 1.0)])),
     )
 
 
 def _log_uniform(rng: np.random.Generator, least: float, most: float) -> float:
     return float(np.exp(rng.uniform(np.log(least), np.log(most))))
+
+
+def _steep(tile: Tile, slope: float) -> Tile:
+    """Scale a pattern to a slope (root mean square, m per m), at most `_HIGHEST` high."""
+    tile = _unit(tile)
+    along, across = tile - np.roll(tile, 1, 0), tile - np.roll(tile, 1, 1)
+    steepness = float(np.sqrt((along**2 + across**2).mean())) / TILE_PITCH
+    return tile * np.float32(min(slope / steepness, _HIGHEST))
 
 
 def _unit(tile: Tile) -> Tile:
@@ -67,22 +88,39 @@ def _noise(rng: np.random.Generator, wavelength: float, octaves: float, falloff:
     return np.fft.irfft2(band * phase, (TILE, TILE)).astype(np.float32)
 
 
+def _grain(rng: np.random.Generator) -> Tile:
+    """Draw what every real surface has: unevenness down to 6 cells, and scratches."""
+    longest = _log_uniform(rng, 60, 200)
+    uneven = _unit(_noise(rng, longest, np.log2(longest / 6), rng.uniform(1.8, 2.2)))
+    return uneven + np.float32(rng.uniform(0, 1)) * _unit(_scratches(rng))
+
+
+def _scratches(rng: np.random.Generator) -> Tile:
+    tile = np.zeros((TILE, TILE), np.float32)
+    for _ in range(int(rng.integers(1, 25))):
+        ends = rng.integers(0, TILE, (2, 2))
+        reach = ends[0] + (ends[1] - ends[0]) * rng.uniform(0.1, 1)
+        height = float(rng.choice([-1, 1]) * rng.uniform(0.2, 1))
+        cv2.line(tile, ends[0].tolist(), reach.astype(int).tolist(), height, 1, cv2.LINE_AA)
+    return _rounded(tile, 2)
+
+
 def _rough(rng: np.random.Generator) -> Tile:
-    return _noise(rng, _log_uniform(rng, 5, 120), rng.uniform(0.7, 4), rng.uniform(0.5, 2.5))
+    return _noise(rng, _log_uniform(rng, 6, 240), rng.uniform(0.7, 4), rng.uniform(0.5, 2.5))
 
 
 def _wrinkles(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
-    wavelength = wavelength or _log_uniform(rng, 15, 100)
+    wavelength = wavelength or _log_uniform(rng, 20, 200)
     folded = np.abs(_noise(rng, wavelength, rng.uniform(0.3, 2), 1.5))
     return folded * np.float32(rng.choice([-1, 1]))
 
 
 def _phases(rng: np.random.Generator, wavelength: float | None = None) -> tuple[Tile, Tile]:
     """Draw two crossing phases (rad) with whole numbers of periods a tile, a little uneven."""
-    periods = int(TILE / wavelength if wavelength else _log_uniform(rng, 4, 70))
+    periods = int(TILE / wavelength if wavelength else _log_uniform(rng, 4, 100))
     y, x = np.mgrid[:TILE, :TILE].astype(np.float32) * np.float32(2 * np.pi / TILE)
     uneven = np.float32(rng.uniform(0, 0.8))
-    bend = _unit(_noise(rng, 100, 1, 1)) * uneven
+    bend = _unit(_noise(rng, 200, 1, 1)) * uneven
     skew = int(rng.integers(-periods, periods + 1)) if rng.random() < 0.3 else 0
     return periods * x + skew * y + bend, periods * y + bend
 
@@ -107,7 +145,7 @@ def _weave(rng: np.random.Generator) -> Tile:
 
 def _grains(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
     tile = np.zeros((TILE, TILE), np.float32)
-    length = wavelength / 2 if wavelength else _log_uniform(rng, 3, 30)
+    length = wavelength / 2 if wavelength else _log_uniform(rng, 4, 60)
     width = length * rng.uniform(0.35, 1)
     count = int(rng.uniform(0.15, 0.8) * TILE**2 / (np.pi * length * width)) + 3
     along = rng.uniform(0, np.pi)
@@ -119,7 +157,7 @@ def _grains(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
         c, s = np.float32(np.cos(turn)), np.float32(np.sin(turn))
         inside = 1 - ((c * x + s * y) / length) ** 2 - ((c * y - s * x) / width) ** 2
         stamps.append(np.sqrt(np.maximum(inside, 0)))
-    for _ in range(min(count, 600)):
+    for _ in range(min(count, 1500)):
         row, column = rng.integers(0, TILE, 2)
         rows = np.arange(row - reach, row + reach + 1) % TILE
         columns = np.arange(column - reach, column + reach + 1) % TILE
@@ -130,7 +168,7 @@ def _grains(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
 
 def _cells(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
     seeds = np.full((TILE, TILE), 255, np.uint8)
-    count = (TILE / wavelength) ** 2 if wavelength else _log_uniform(rng, 12, 900)
+    count = (TILE / wavelength) ** 2 if wavelength else _log_uniform(rng, 12, 1500)
     points = rng.integers(0, TILE, (int(count), 2))
     seeds[points[:, 0], points[:, 1]] = 0
     around = cv2.copyMakeBorder(seeds, 64, 64, 64, 64, cv2.BORDER_WRAP)
@@ -140,13 +178,13 @@ def _cells(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
 
 def _strands(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
     tile = np.zeros((TILE, TILE), np.float32)
-    width = int(wavelength / 4 if wavelength else rng.integers(1, 9))
+    width = int(wavelength / 4 if wavelength else rng.integers(1, 17))
     main = rng.uniform(0, np.pi)
     spread = rng.choice([0.15, 1.5])
     count = 5 * TILE / wavelength if wavelength else _log_uniform(rng, 4, 60)
     for _ in range(int(count)):
         angle = main + spread * rng.normal()
-        reach = np.array([np.cos(angle), np.sin(angle)]) * rng.uniform(30, 300)
+        reach = np.array([np.cos(angle), np.sin(angle)]) * rng.uniform(60, 600)
         middle = rng.uniform(0, TILE, 2)
         ends = [tuple(int(v) for v in middle + sign * reach) for sign in (-1, 1)]
         cv2.line(tile, ends[0], ends[1], float(rng.uniform(0.5, 1)), width, cv2.LINE_AA)
@@ -159,7 +197,7 @@ def _plateaus(rng: np.random.Generator, wavelength: float | None = None) -> Tile
     count = 4 * TILE / wavelength if wavelength else rng.integers(2, 14)
     for _ in range(int(count)):
         at = tuple(int(v) for v in rng.integers(0, TILE, 2))
-        size = wavelength or _log_uniform(rng, 8, 60)
+        size = wavelength or _log_uniform(rng, 16, 120)
         if rng.random() < 0.3:
             text = "".join(rng.choice(list("ABEKRSXZ0235689"), 3))
             cv2.putText(tile, text, at, cv2.FONT_HERSHEY_SIMPLEX, size / 25, white, 3, cv2.LINE_AA)
@@ -170,7 +208,7 @@ def _plateaus(rng: np.random.Generator, wavelength: float | None = None) -> Tile
         else:
             box = cv2.boxPoints((at, (size, size * rng.uniform(0.3, 1)), rng.uniform(0, 180)))
             cv2.fillConvexPoly(tile, box.astype(np.int32), white, cv2.LINE_AA)
-    return _rounded(tile.astype(np.float32), rng.uniform(1, 8)) * np.float32(
+    return _rounded(tile.astype(np.float32), rng.uniform(1, 10)) * np.float32(
         rng.choice([1, 1, 1, -1])
     )
 

@@ -101,14 +101,16 @@ def _judge(scores: Float[np.ndarray, "n c"], truth: np.ndarray) -> dict[str, Any
         "accuracy": float(hit.mean()),
         "interval": list(mean_interval(hit.astype(float), _BOOTSTRAPS)),
         "balanced": float(np.mean(recall)),
+        "answers": np.bincount(scores.argmax(1), minlength=scores.shape[1]).tolist(),
     }
 
 
 def _table(rows: list[dict[str, Any]], frequent: float, objects: int, materials: list[str]) -> str:
     title = f"material of {objects} real objects by sentences [95 % over objects]"
-    lines = [["", "right", "balanced"]]
+    lines = [["", "right", "balanced", "answered"]]
     for row in rows:
         right = "{:.2f} [{:.2f}, {:.2f}]".format(row["accuracy"], *row["interval"])
-        lines.append([row["encoder"], right, f"{row['balanced']:.2f}"])
-    lines.append(["the most frequent material", f"{frequent:.2f}", f"{1 / len(materials):.2f}"])
+        answers = " ".join(map(str, row["answers"]))
+        lines.append([row["encoder"], right, f"{row['balanced']:.2f}", answers])
+    lines.append(["the most frequent material", f"{frequent:.2f}", f"{1 / len(materials):.2f}", ""])
     return "\n".join([f"{title}: {', '.join(materials)}", *aligned(lines)])
