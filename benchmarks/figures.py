@@ -130,6 +130,13 @@ def markers(metrics: Metrics) -> str:
     return f"{metrics['near']:.1%} of {metrics['dots']} dots; {metrics['exchanged']} exchanged"
 
 
+def slip(metrics: Metrics) -> str:
+    """AUC of slip by the markers' motion in each window, and its pairs within one object."""
+    rows = [row for row in metrics["rows"] if row["features"] == "markers"]
+    figure = "{:.2f} [{:.2f}, {:.2f}]".format
+    return "; ".join(f"{r['window']} {figure(*r['crop'])} ({figure(*r['object'])})" for r in rows)
+
+
 def nearest(metrics: Metrics) -> str:
     """Nearest-video accuracy of every encoder."""
     rows = []
