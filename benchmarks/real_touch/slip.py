@@ -7,10 +7,10 @@ a slip is compared only with grasps without slip in the same crop.
 from dataclasses import field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Real, UInt8
 
 from benchmarks.options import BenchmarkOptions
 from benchmarks.real_touch import property_probe as probe
@@ -46,18 +46,26 @@ _GRID: MarkerGrid = GELSIGHT_MINI_MARKERS.markers  # pyright: ignore[reportAssig
 _FINGERS = "finger_0", "finger_2"
 
 
+class Labels(NamedTuple):
+    """Labels of n grasps; the crop of the camera is told by the spacing of the dots."""
+
+    objects: probe.Objects
+    slip: Bool[np.ndarray, " n"]
+    crop: Int[np.ndarray, " n"]
+
+
 def run(config: Config) -> dict[str, Any]:
     """Predict slip by every kind of feature in every window."""
     index = config.data / "grasps.csv"
     table = read_table(index, ("object", "slip", "frames_kept", *_FINGERS))
-    check_there((config.data / row[finger] for row in table for finger in _FINGERS), index)
-    encoders = {name: load_encoder(name).eval() for name in config.encoders}
-    objects = np.array([row["object"] for row in table])
-    slip = np.array([row["slip"] == "1" for row in table])
-    length = np.array([min(int(row["frames_kept"]), _LONGEST) for row in table])
     clips = [[config.data / row[finger] for finger in _FINGERS] for row in table]
+    check_there(sum(clips, []), index)
+    encoders = {name: load_encoder(name).eval() for name in config.encoders}
+    objects, slip = np.array([(row["object"], row["slip"]) for row in table]).T
+    length = np.array([min(int(row["frames_kept"]), _LONGEST) for row in table])
     crop = np.array([int(_tracker(read_frames(c[0])[0][0])[1] > _WIDE) for c in clips])
-    ends = _window_ends(slip, length, crop)
+    labels = Labels(objects, slip == "1", crop)
+    ends = _window_ends(labels, length)
     found = [
         [read_finger(read_frames(path)[0][: own.max()], own, encoders) for path in clip]
         for clip, own in track(list(zip(clips, ends, strict=True)), "tracking", "grasp")
@@ -65,23 +73,18 @@ def run(config: Config) -> dict[str, Any]:
     rows = []
     for w, window in enumerate(WINDOWS):
         features = {n: np.array([[f[w][n] for f in g] for g in found]) for n in found[0][0][0]}
-        features["control: frame of the end"] = np.repeat(ends[:, w, None, None], 2, 1).astype(
-            float
-        )
+        features["control: frame of the end"] = np.repeat(1.0 * ends[:, w, None, None], 2, 1)
         for name, own in features.items():
-            scores = predict_slip(own, slip, crop, objects)
-            rows.append({"window": window, "features": name, **judge(scores, slip, crop, objects)})
-    leaks = {"length": -length, "crop": crop}
-    leaks = {name: stratified_auc(x, slip, np.zeros_like(crop)) for name, x in leaks.items()}
-    result = {"grasps": len(slip), "slips": int(slip.sum()), "leaks": leaks, "rows": rows}
+            rows.append({"window": window, "features": name, **judge(own, labels)})
+    values = {"length": -length, "crop": crop}
+    leaks = {n: auc(np.stack([x, labels.slip, 0 * crop], 1)) for n, x in values.items()}
+    result = {"grasps": len(slip), "slips": int(labels.slip.sum()), "leaks": leaks, "rows": rows}
     return {"table": _table(result), **result}
 
 
-def _window_ends(
-    slip: Bool[np.ndarray, " n"], length: Int[np.ndarray, " n"], crop: Int[np.ndarray, " n"]
-) -> Int[np.ndarray, "n windows"]:
+def _window_ends(labels: Labels, length: Int[np.ndarray, " n"]) -> Int[np.ndarray, "n windows"]:
     """Return where windows end: without slip, as late as recordings of a slip in the same crop."""
-    ends, rng = length.copy(), np.random.default_rng(0)
+    (_, slip, crop), ends, rng = labels, length.copy(), np.random.default_rng(0)
     for row in np.flatnonzero(~slip):
         fits = length[slip & (crop == crop[row]) & (length <= length[row])]
         ends[row] = rng.choice(fits) if len(fits) else length[row]
@@ -122,38 +125,26 @@ def read_finger(
 
 
 def motion_features(dots: Float[np.ndarray, "t rows columns 2"]) -> Float[np.ndarray, " 8"]:
-    """Return logarithms of how far the dots move, rigidly and otherwise.
-
-    Mean displacement and residual of its affine fit, over the window and from frame to frame
-    (largest, mean); rotation and expansion over the window.
-    """
+    """Return the log of an affine fit's figures over the window, and at most and usually by frame."""
     points = dots.reshape(len(dots), -1, 2).astype(float)
-    net, left, turned, grown = _affine(points[0], points[-1])
     steps = np.array([_affine(a, b)[:2] for a, b in pairwise(points)])
-    return np.log(1e-3 + np.array([net, left, *steps.max(0), *steps.mean(0), turned, grown]))
+    return np.log(1e-3 + np.hstack([_affine(points[0], points[-1]), steps.max(0), steps.mean(0)]))
 
 
-def _affine(
-    one: Float[np.ndarray, "n 2"], other: Float[np.ndarray, "n 2"]
-) -> tuple[float, float, float, float]:
-    """Return mean displacement, rms residual of its affine fit, and the fit's rotation and expansion."""
+def _affine(one: Float[np.ndarray, "n 2"], other: Float[np.ndarray, "n 2"]) -> list[float]:
+    """Return mean displacement, rms residual of the affine fit, and its rotation and expansion."""
     terms = np.column_stack([np.ones(len(one)), one - one.mean(0)])
     shift, x, y = fit = np.linalg.lstsq(terms, other - one, rcond=None)[0]
     left = np.sqrt(np.square(other - one - terms @ fit).sum(1).mean())
-    return float(np.linalg.norm(shift)), float(left), abs(x[1] - y[0]), abs(x[0] + y[1])
+    return [float(np.linalg.norm(shift)), float(left), abs(x[1] - y[0]), abs(x[0] + y[1])]
 
 
-def predict_slip(
-    features: Float[np.ndarray, "n 2 d"],
-    slip: Bool[np.ndarray, " n"],
-    crop: Int[np.ndarray, " n"],
-    objects: probe.Objects,
-) -> Float[np.ndarray, " n"]:
+def predict_slip(features: Float[np.ndarray, "n 2 d"], labels: Labels) -> Float[np.ndarray, " n"]:
     """Return scores of slip by a ridge on other objects, the mean over fingers.
 
     Features are standardised and labels centred within each crop, so the crop helps nothing.
     """
-    inputs, scores = features.copy(), np.zeros(len(slip))
+    (objects, slip, crop), inputs, scores = labels, features.copy(), np.zeros(len(features))
     for own in (crop == c for c in np.unique(crop)):
         inputs[own] = (inputs[own] - inputs[own].mean((0, 1))) / (inputs[own].std((0, 1)) + 1e-6)
     for test in probe.folds(objects):
@@ -164,39 +155,31 @@ def predict_slip(
     return scores
 
 
-def judge(
-    scores: Float[np.ndarray, " n"],
-    slip: Bool[np.ndarray, " n"],
-    crop: Int[np.ndarray, " n"],
-    objects: probe.Objects,
-) -> dict[str, list[float]]:
+def judge(features: Float[np.ndarray, "n 2 d"], labels: Labels) -> dict[str, list[float]]:
     """Return AUC and its interval by pairs of one crop, and by pairs of one object in one crop."""
+    (objects, slip, crop), found, scores = labels, {}, predict_slip(features, labels)
     _, one = np.unique([objects, crop.astype(str)], axis=1, return_inverse=True)
-    found = {}
     for name, strata in (("crop", crop), ("object", one)):
         both = np.array([len(set(slip[strata == s])) == 2 for s in strata])
         values = np.column_stack([scores, slip, strata])[both]
-        interval = probe.interval(values, objects[both], _auc_of)
-        found[name] = [_auc_of(values), *interval]
+        found[name] = [auc(values), *probe.interval(values, objects[both], auc)]
     return found
 
 
-def _auc_of(values: Float[np.ndarray, "n 3"]) -> float:
-    return stratified_auc(values[:, 0], values[:, 1] > 0, values[:, 2])
-
-
-def stratified_auc(scores: np.ndarray, slip: Bool[np.ndarray, " n"], strata: np.ndarray) -> float:
-    """Return how often a slip scores above a grasp of its stratum without one; ties count half."""
-    above = np.sign(scores[slip][:, None] - scores[~slip])
-    return float((1 + above[strata[slip][:, None] == strata[~slip]]).mean() / 2)
+def auc(values: Real[np.ndarray, "n 3"]) -> float:
+    """Return AUC by pairs of one stratum; columns are score, slip and stratum, ties count half."""
+    slips, others = values[values[:, 1] > 0], values[values[:, 1] == 0]
+    above = np.sign(slips[:, None, 0] - others[:, 0])
+    return float((1 + above[slips[:, None, 2] == others[:, 2]]).mean() / 2)
 
 
 def _table(result: dict[str, Any]) -> str:
-    leaks, width = result["leaks"], max(len(row["features"]) for row in result["rows"]) + 2
+    width = max(len(row["features"]) for row in result["rows"]) + 2
     lines = [
-        f"{result['grasps']} grasps, {result['slips']} slips; AUC of slip on objects held out [95 % over objects],",
-        f"windows of {LENGTH} frames. Unfit to use: shortness {leaks['length']:.2f}, the camera's crop "
-        f"{leaks['crop']:.2f}",
+        f"AUC of slip on objects held out [95 % over objects], windows of {LENGTH} frames",
+        "{grasps} grasps, {slips} slips; leaks: shortness {length:.2f}, the camera's crop {crop:.2f}".format(
+            **result, **result["leaks"]
+        ),
     ]
     for window in WINDOWS:
         lines += ["", f"{window:<{width}}{'pairs of one crop':<19}pairs of one object"]
