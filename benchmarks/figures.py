@@ -131,10 +131,9 @@ def markers(metrics: Metrics) -> str:
 
 
 def slip(metrics: Metrics) -> str:
-    """AUC of slip by the markers' motion in each window, and its pairs within one object."""
+    """AUC of slip by the markers' motion in each window."""
     rows = [row for row in metrics["rows"] if row["features"] == "markers"]
-    figure = "{:.2f} [{:.2f}, {:.2f}]".format
-    return "; ".join(f"{r['window']} {figure(*r['crop'])} ({figure(*r['object'])})" for r in rows)
+    return "; ".join("{} {:.2f} [{:.2f}, {:.2f}]".format(r["window"], *r["crop"]) for r in rows)
 
 
 def nearest(metrics: Metrics) -> str:
