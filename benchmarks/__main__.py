@@ -46,6 +46,7 @@ BENCHMARKS = {
     "real-touch": ("real_touch.videos", "encoders on labelled videos of real touch"),
     "real-words": ("real_touch.words", "hardness, roughness and bumpiness named by sentences"),
     "real-force": ("real_touch.forces", "force and contact on real grasps with a load cell"),
+    "real-slip": ("real_touch.slip", "slip told on real grasps, objects held out"),
     "real-markers": ("real_touch.markers", "gel dots of real images against another tracker"),
     "touch-spectrum": (
         "real_touch.touch_spectrum",

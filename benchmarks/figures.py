@@ -130,6 +130,12 @@ def markers(metrics: Metrics) -> str:
     return f"{metrics['near']:.1%} of {metrics['dots']} dots; {metrics['exchanged']} exchanged"
 
 
+def slip(metrics: Metrics) -> str:
+    """AUC of slip by the markers' motion in each window."""
+    rows = [row for row in metrics["rows"] if row["features"] == "markers"]
+    return "; ".join("{} {:.2f} [{:.2f}, {:.2f}]".format(r["window"], *r["crop"]) for r in rows)
+
+
 def nearest(metrics: Metrics) -> str:
     """Nearest-video accuracy of every encoder."""
     rows = []

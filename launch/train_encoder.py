@@ -100,7 +100,7 @@ class Surfaces:
 
     sensor: str = "gelsight_mini"
     """Simulated sensor: a name, or the folder of a sensor file."""
-    surfaces: Annotated[int, Field(ge=16)] = 5000
+    surfaces: Annotated[int, Field(ge=16)] = 2000
     """Number of random surfaces."""
     presses_per_surface: Annotated[int, Field(ge=2)] = 4
     """Presses of each surface, each with another sensor instance, place, rotation and depth."""

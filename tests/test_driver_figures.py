@@ -332,7 +332,7 @@ def test_how_old_a_image_may_be(wall: Wall, monkeypatch: Patch) -> None:
 
 def test_a_fingertip_is_lost_after_five_seconds(wall: Wall, monkeypatch: Patch) -> None:
     monkeypatch.setattr(fingertip_source, "VideoCamera", MagicMock())
-    monkeypatch.setattr(fingertip_source, "TactileCamera", made := MagicMock())
+    monkeypatch.setattr(fingertip_source.tactile_camera, "TactileCamera", made := MagicMock())
     made.return_value.read.return_value = Frame(np.zeros((240, 320, 3), np.uint8), 0, 0.0)
     assert complaint(list, fingertip_source.open_frames("http://here", GELSIGHT_MINI))
     assert wall.now == pytest.approx(5.0, abs=0.011)

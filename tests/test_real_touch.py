@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from benchmarks.published_touch.force_grasps import read_force_grasps
-from benchmarks.real_touch import forces, markers, touch_spectrum, words
+from benchmarks.real_touch import forces, markers, property_probe, slip, touch_spectrum, words
 from benchmarks.real_touch.embedders import find_embedder
 from benchmarks.real_touch.property_probe import (
     adapted_nearest_is_same,
@@ -230,3 +230,17 @@ def test_markers_are_compared_with_another_trackers(tmp_path: Path) -> None:
     (tmp_path / "gel_2.json").write_text("[1, 2]")
     with pytest.raises(UserError, match=r"gel_2.json does not hold 5 tables"):
         markers.run(markers.Config(data=tmp_path))
+
+
+def test_slip_is_told_by_motion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dots that creep against dots at rest; the shorter recordings help nothing."""
+    monkeypatch.setattr(property_probe, "_BOOTSTRAPS", 20)
+    lines = ["object,slip,frames_kept,finger_0,finger_2"]
+    for slips, frames in ((1, 50), (0, 60)):
+        clip = [dotted_image(0.1 * slips * i) for i in range(frames)]
+        write_video(tmp_path / f"{slips}.mp4", np.stack(clip), 25)
+        lines += [f"thing{i},{slips},{frames},{slips}.mp4,{slips}.mp4" for i in range(3)]
+    (tmp_path / "grasps.csv").write_text("\n".join(lines))
+    rows = slip.run(slip.Config(data=tmp_path, encoders=()))["rows"]
+    found = {row["features"]: row["object"][0] for row in rows}
+    assert found["markers"] == 1.0 and found["control: frame of the end"] == 0.5

@@ -193,7 +193,7 @@ def test_a_twin_ends_with_what_started_it_and_says_its_pace(tmp_path: Path) -> N
     wait = f"until [ -e {tmp_path}/cell.json ]; do sleep 0.1; done"
     log = tmp_path / "log"
     subprocess.run(["sh", "-c", f"{twin} >{log} 2>&1 </dev/null & {wait}"], check=True, timeout=120)
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 120
     while not log.read_text().endswith("no pace to report\nstopped\n"):
         assert time.monotonic() < deadline, log.read_text()
         time.sleep(0.1)

@@ -165,11 +165,11 @@ def _ridge(
 ) -> Float[np.ndarray, "m properties ranks"]:
     """Return a score for each rank of each property."""
     targets = np.eye(N_RANKS)[ranks].reshape(len(ranks), -1)
-    scores = _ridge_scores(embeddings, targets, test_embeddings, strength)
+    scores = ridge_scores(embeddings, targets, test_embeddings, strength)
     return scores.reshape(len(test_embeddings), ranks.shape[1], N_RANKS)
 
 
-def _ridge_scores(
+def ridge_scores(
     inputs: Float[np.ndarray, "n d"],
     targets: Float[np.ndarray, "n k"],
     test_inputs: Float[np.ndarray, "m d"],

@@ -144,7 +144,7 @@ def check_unpressed(image: Image, sensor: SensorModel, name: str) -> None:
     the UserError, which is also raised for a marker gel that shows no dots.
     """
     calibration, image = load(sensor.sensor_file), without_dots(image, sensor)
-    background = _in_light_of(image, calibration.background)
+    background = in_light_of(image, calibration.background)
     change = local_change(image, background)
     least = _PAINTED if sensor.markers else _PRESSED
     if sensor.images_only or float(change.max()) < least:
@@ -157,7 +157,7 @@ def check_unpressed(image: Image, sensor: SensorModel, name: str) -> None:
         )
 
 
-def _in_light_of(image: Image, background: Image) -> Counts:
+def in_light_of(image: Image, background: Image) -> Counts:
     """Return a background times a smooth factor, fitted to an image by its log ratio, but for outliers."""
     rows, columns, _ = background.shape
     w, h = size = columns // _COARSE, rows // _COARSE

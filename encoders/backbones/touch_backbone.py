@@ -141,14 +141,17 @@ class BaseTouchEncoder(nn.Module):
 
     @torch.no_grad()
     def embed_frames(
-        self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
-    ) -> Float32[np.ndarray, "n d"]:
-        """Embed raw frames of one sensor, in the order of recording.
+        self,
+        frames: UInt8[np.ndarray, "n h w 3"],
+        background: UInt8[np.ndarray, "h w 3"],
+        rows: Int[np.ndarray, " k"] | None = None,
+    ) -> Float32[np.ndarray, "k d"]:
+        """Embed raw frames of one sensor, in the order of recording, or only those at `rows`.
 
         The first frame stands for frames before it. UserError: the frames are not of this encoder's
         sensor.
         """
-        rows = np.arange(len(frames))
+        rows = np.arange(len(frames)) if rows is None else rows
         embedded = np.empty((len(rows), self._width), np.float32)
         for i in range(0, len(rows), BATCH):
             inputs = past_rows(rows[i : i + BATCH], self.offsets)
