@@ -1,10 +1,12 @@
 """The twin over the wire: its controllers by their makers' clients, its load cell, its control port."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -192,8 +194,12 @@ def test_a_twin_ends_with_what_started_it_and_says_its_pace(tmp_path: Path) -> N
     twin = f"{sys.executable} -m touchgoal.launch twin {arguments} --out {tmp_path}"
     wait = f"until [ -e {tmp_path}/cell.json ]; do sleep 0.1; done"
     log = tmp_path / "log"
-    subprocess.run(["sh", "-c", f"{twin} >{log} 2>&1 </dev/null & {wait}"], check=True, timeout=120)
-    deadline = time.monotonic() + 120
+    hears = partial(
+        signal.signal, signal.SIGHUP, signal.SIG_DFL
+    )  # also where the tests run by nohup
+    command = ["sh", "-c", f"{twin} >{log} 2>&1 </dev/null & {wait}"]
+    subprocess.run(command, check=True, timeout=120, preexec_fn=hears)
+    deadline = time.monotonic() + 30
     while not log.read_text().endswith("no pace to report\nstopped\n"):
         assert time.monotonic() < deadline, log.read_text()
         time.sleep(0.1)
