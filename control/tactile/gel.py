@@ -28,13 +28,16 @@ def pixels_per_cell(pitch: float) -> int:
     return 2 ** max(round(math.log2(CELL / pitch)), 0)
 
 
-def deform(overlap: Map, pitch: float, blur_sigmas: tuple[float, ...]) -> Map:
+def deform(
+    overlap: Map, pitch: float, blur_sigmas: tuple[float, ...], textured: bool = False
+) -> Map:
     """Return the gel's surface (m) under an object's overlap (m, 0 without one) with the flat gel.
 
     The gel follows the object in contact and bulges smoothly around it: Taxim's contact-constrained
     pyramid, on coarse cells. (Box blurs would be faster, but their corners show as a cross around a
     small contact.) Full-resolution detail is added back inside the contact. `pitch` is m per pixel;
-    `blur_sigmas` are the standard deviations of the pyramid, coarse to fine, m.
+    `blur_sigmas` are the standard deviations of the pyramid, coarse to fine, m. `textured` says that
+    detail as fine as a pixel counts; without, the result is smoothed, which fits real balls better.
     """
     h, w = overlap.shape
     scale = pixels_per_cell(pitch)
@@ -52,7 +55,7 @@ def deform(overlap: Map, pitch: float, blur_sigmas: tuple[float, ...]) -> Map:
     size = detail.shape[::-1]
     low, soft = (cv2.resize(a[cells], size, interpolation=cv2.INTER_LINEAR) for a in (low, soft))
     surface[pixels] += soft * (detail - low)
-    return surface
+    return surface if textured else cv2.GaussianBlur(surface, (3, 3), 0)
 
 
 def _around(

@@ -112,9 +112,7 @@ class TactilePad:
         # The solver's coefficient: the object's, which has priority over the gel's.
         friction = max(float(self._model.geom_friction[geom, 0]) for geom in contact.geoms)
         self._field = force_field(press, self._field, contact, friction, self._sensor)
-        surface = deform(overlap, grid.pitch, self._instance.calibration.blur_sigmas)
-        if not textured:
-            surface = cv2.GaussianBlur(surface, (3, 3), 0)  # it is doubled: no creases
+        surface = deform(overlap, grid.pitch, self._instance.calibration.blur_sigmas, textured)
         if self._relief is not None:
             surface += self._relief(self._field, overlap, grid)
         image = render(surface, self._instance, rng)

@@ -98,5 +98,5 @@ def press(
     _, h, w = instance.background.shape
     pitch = instance.pixel_pitch
     raw = overlap(surface, pose, (h, w), pitch)
-    deformed = deform(raw, pitch, instance.calibration.blur_sigmas)
+    deformed = deform(raw, pitch, instance.calibration.blur_sigmas, textured=True)
     return instance.with_dots(render(deformed, instance, rng))
