@@ -177,7 +177,7 @@ def _exchanged(frames: tuple[Image, Image], first: tuple[Image, Image]) -> bool:
 
 
 def check_touch(frames: UInt8[np.ndarray, "n h w 3"], sensor: SensorModel, name: str) -> None:
-    """Refuse a fingertip whose first 5 frames contradict its sensor file, are pressed, or too compressed.
+    """Refuse a fingertip whose first frames contradict its sensor file, are pressed, or too compressed.
 
     `name` is for the UserError; see `image_guard` and `contact.coarse`.
     """

@@ -17,8 +17,8 @@ from touchgoal.launch.__main__ import COMMANDS
 
 # Ceilings fall with every change that removes, and rise only by the budget that an issue names,
 # in a change that says so.
-WHEEL_LINES = 49_950  # of Python
-REPOSITORY_LINES = 61_100  # of Python, outside tests/
+WHEEL_LINES = 49_930  # of Python
+REPOSITORY_LINES = 61_080  # of Python, outside tests/
 TEST_LINES = 18_720  # of Python
 PAGE_WORDS = 12_000  # README, CHANGELOG and docs/*.md
 COMMANDS_IN_ALL = 32  # sub-commands included

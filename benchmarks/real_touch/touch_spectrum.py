@@ -2,7 +2,8 @@
 
 A touch's change from the untouched image, brightness removed, is split into five bands by
 differences of Gaussians. In the contact, and with the camera's noise taken out, the root mean
-square of each is the figure; a thing's is the mean power of its touches.
+square of each band is the figure of a touch. A video counts as one touch: the mean power of its five
+frames of the largest change.
 """
 
 from dataclasses import dataclass, field, replace
@@ -116,10 +117,9 @@ def _touch(
 def _mini(folder: Path, every: int) -> Touches:
     rows, things = [], []
     for video in track(read_labelled_videos(folder)[::every], "videos", "video"):
-        frames = video.frames()
-        untouched = np.median(frames[:5], 0).astype(np.float32)
-        firmest = firmest_frames(frames, untouched.astype(np.uint8))
-        found = [r for k in firmest if (r := _touch(frames[k], untouched)) is not None]
+        frames, untouched = video.open()
+        firmest = frames[firmest_frames(frames, untouched)]
+        found = [r for f in firmest if (r := _touch(f, untouched.astype(np.float32))) is not None]
         if found:
             contact, noise = np.mean(found, 0)[0], np.median(found, 0)[1]
             rows.append(np.maximum(contact - noise, 0))

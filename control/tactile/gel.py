@@ -49,28 +49,11 @@ def deform(
         cv2.copyTo(low, contact, smooth)
     smooth = cv2.GaussianBlur(smooth, (5, 5), 0)  # the constraint's edge is no edge of the gel
     soft = cv2.GaussianBlur(contact.astype(np.float32), (5, 5), 0)
-    surface = cv2.resize(smooth, (w, h), interpolation=cv2.INTER_LINEAR)
-    cells, pixels = _around(contact, scale, overlap.shape)  # detail is found nowhere else
-    detail = overlap[pixels]
-    size = detail.shape[::-1]
-    low, soft = (cv2.resize(a[cells], size, interpolation=cv2.INTER_LINEAR) for a in (low, soft))
-    surface[pixels] += soft * (detail - low)
-    return surface if textured else cv2.GaussianBlur(surface, (3, 3), 0)
-
-
-def _around(
-    contact: UInt8[np.ndarray, "h w"], scale: int, shape: tuple[int, ...]
-) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Return the cells that hold a contact and what blurring adds to it, and their pixels."""
-    if shape != (scale * contact.shape[0], scale * contact.shape[1]):
-        return (slice(None), slice(None)), (slice(None), slice(None))
-    x, y, width, height = cv2.boundingRect(contact)
-    ends = (y - 3, y + height + 3), (x - 3, x + width + 3)
-    rows, columns = (
-        slice(max(a, 0), min(b, n)) for (a, b), n in zip(ends, contact.shape, strict=True)
+    smooth, low, soft = (
+        cv2.resize(a, (w, h), interpolation=cv2.INTER_LINEAR) for a in (smooth, low, soft)
     )
-    fine = [slice(scale * part.start, scale * part.stop) for part in (rows, columns)]
-    return (rows, columns), (fine[0], fine[1])
+    surface = smooth + soft * (overlap - low)
+    return surface if textured else cv2.GaussianBlur(surface, (3, 3), 0)
 
 
 def _contact(overlap: Map) -> UInt8[np.ndarray, "h w"]:
