@@ -7,7 +7,7 @@ for hardware no longer than a time-out; a device that is broken for good raises 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -80,6 +80,8 @@ class CostReading:
 
     cost: float
     stamp: float
+    verdict: Literal["", "success", "failure", "unsure"] = ""  # of a judge; "": none, or not asked
+    reasons: tuple[str, ...] = ()  # of the verdict, for people
 
 
 @runtime_checkable

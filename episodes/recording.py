@@ -107,7 +107,9 @@ def run(
     info: dict[str, Any],
     expert: Actor | None = None,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Act until the episode ends; yield each tick's observation, action and ground truth.
+    """Act until the episode ends, then rest as long as the environment's config says.
+
+    Yields each tick's observation, action and ground truth.
 
     The environment was just reset. An expert's actions, if given, are recorded in place of the
     actor's.
@@ -121,6 +123,9 @@ def run(
             break
     still = np.append(np.zeros(env.n_joints), recorded[-1]).astype(np.float32)
     yield {**observation, ft.ACTION: still, **info}
+    for _ in range(round(env.config.rest * env.config.control_hz)):
+        observation, _, _, _, info = env.step(still)
+        yield {**observation, ft.ACTION: still, **info}
 
 
 def record_episode(

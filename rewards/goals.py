@@ -22,6 +22,7 @@ from touchgoal.control.features import (
     TACTILE,
     TACTILE_LEFT,
     TACTILE_RIGHT,
+    TCP_POSE,
     TRUTH_CONTACT,
     WRENCH,
 )
@@ -147,7 +148,7 @@ class EpisodeEnd:
                 f"goal '{self}' does not exist: {self.root} has episodes 0 to {len(episodes) - 1}"
             )
         length = episodes.lengths[self.index]
-        wanted = dict.fromkeys((*also, TRUTH_CONTACT, WRENCH))
+        wanted = dict.fromkeys((*also, TRUTH_CONTACT, WRENCH, TCP_POSE))
         more = [key for key in wanted if key in episodes.features and key not in keys]
         frames = [*range(min(START_FRAMES, length)), length - 1]
         return episodes.read(self.index, [*keys, *more], frames)

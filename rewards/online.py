@@ -84,7 +84,7 @@ class CostMeter:
 
 def _stacked(ticks: Sequence[ft.Observation]) -> dict[str, np.ndarray]:
     """Return what the cost reads of some ticks, by key."""
-    keys = [key for key in (*ft.CAMERAS, *ft.TACTILE, ft.WRENCH) if key in ticks[0]]
+    keys = [key for key in (*ft.CAMERAS, *ft.TACTILE, ft.WRENCH, ft.TCP_POSE) if key in ticks[0]]
     return {key: np.stack([tick[key] for tick in ticks]) for key in keys}
 
 

@@ -1,7 +1,8 @@
 """The reward: how far each frame of a trajectory is from a goal, in images, touch and words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import overload
 
@@ -19,6 +20,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNormalizer, scene_of
+from touchgoal.rewards.end_state import end_cost, end_costs
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_trajectory
@@ -36,6 +38,7 @@ from touchgoal.rewards.goals import (
     goals_of_script,
     same_episode,
 )
+from touchgoal.rewards.judge import FIT_JUDGE, JUDGE, Judge, Judgement
 from touchgoal.rewards.sources.episode_trajectories import default_goals
 from touchgoal.rewards.sources.open_source import open_source
 from touchgoal.rewards.sources.trajectory import Source
@@ -57,6 +60,27 @@ class PreparedReward:
     value: Value | None  # value of the task, if one lies beside the normalizer
     note: str  # which normalizer, or why there is none, for people
     plain: bool = False  # plain distances in place of the parts
+    folder: Path | None = None  # of the normalizer, in which a judge may lie
+
+    @cached_property
+    def judge(self) -> Judge:
+        """The judge beside the normalizer; UserError if there is none."""
+        if self.folder is None or not (self.folder / JUDGE).is_file():
+            raise UserError(f"no judge lies beside the normalizer ({self.note}): {FIT_JUDGE}")
+        return Judge.load(self.folder / JUDGE)
+
+    def end_costs(self, episode: EmbeddedEpisode) -> dict[str, float]:
+        """Return the cost of each part at the end of an episode that `embedder` embedded."""
+        assert self.normalizer is not None  # a judge lies beside one
+        goal = self.embedder.embed_goal(self.goals, episode)
+        return end_costs(
+            episode.features, episode.fps, goal.features, self.normalizer.unit, self.value
+        )
+
+    def judge_episode(self, episode: EmbeddedEpisode) -> Judgement:
+        """Return the judgement of an episode that `embedder` embedded; UserError without a judge."""
+        judge, parts = self.judge, self.end_costs(episode)
+        return judge.judge(parts, end_cost(parts))
 
     def curves(
         self, trajectory: EmbeddedEpisode, before: Mapping[str, float] | None = None
@@ -175,21 +199,30 @@ class Reward:
                 read, a goal that no modality takes.
         """
         if isinstance(recording, EpisodeSet | str | Path):
-            opened = isinstance(recording, EpisodeSet)
-            root, keys = (recording.root, recording.keys) if opened else (Path(recording), None)
-            source = open_source(root, camera, keys=keys)
-            if source.skipped:
-                raise UserError(source.skipped[0].reason)
-            prepared = self.prepare_source(source)
-            return [
-                prepared[t.name].curves(embed_trajectory(prepared[t.name].embedder, t))
-                for t in source.trajectories
-            ]
+            return [reward.curves(e) for reward, e in self._embed_set(recording, camera)]
         if recording is None:
             recording, scene = _as_episode(images, tactile, camera), _ARRAYS
         else:
             scene = scene_of(recording.frames)
-        return self._measure_episode(recording, camera, fps, scene)
+        reward, embedded = self._embed_episode(recording, camera, fps, scene)
+        return reward.curves(embedded)
+
+    @overload
+    def judge(self, recording: Episode, *, fps: float = CONTROL_HZ) -> Judgement: ...
+    @overload
+    def judge(self, recording: EpisodeSet | str | Path) -> list[Judgement]: ...
+    def judge(
+        self, recording: Episode | EpisodeSet | str | Path, *, fps: float = CONTROL_HZ
+    ) -> Judgement | list[Judgement]:
+        """Return whether an episode, or each of a set, ended in success: success, failure or unsure.
+
+        UserError: no judge lies beside the normalizer (`touchgoal fit-normalizer --judge`), or as
+        for curves.
+        """
+        if isinstance(recording, Episode):
+            found = self._embed_episode(recording, FRONT, fps, scene_of(recording.frames))
+            return found[0].judge_episode(found[1])
+        return [reward.judge_episode(e) for reward, e in self._embed_set(recording, FRONT)]
 
     def prepare(self, inputs: Inputs, goals: Sequence[GoalSpec] = ()) -> PreparedReward:
         """Check the goals against what will be measured, load the encoders, choose the normalizer.
@@ -209,11 +242,11 @@ class Reward:
             sensor = SENSORS.get(embedder.made_with.sensor)
             if why_not := "the sensor is unknown" if sensor is None else sensor.images_only:
                 raise UserError(f"goal '{assigned['force']}': {why_not}")
-        normalizer, value, note = self._choose_normalizer(inputs, assigned, embedder)
+        normalizer, value, note, folder = self._choose_normalizer(inputs, assigned, embedder)
         parts = normalizer is not None and bool(normalizer.unit) and not self._plain
         if not parts and "force" not in assigned:
             embedder = self.embedder(inputs, parts=False)
-        return PreparedReward(embedder, assigned, normalizer, value, note, self._plain)
+        return PreparedReward(embedder, assigned, normalizer, value, note, self._plain, folder)
 
     def prepare_source(self, source: Source) -> dict[str, PreparedReward]:
         """Prepare for each trajectory of a source, by name; see `prepare`."""
@@ -264,10 +297,10 @@ class Reward:
 
     def _choose_normalizer(
         self, inputs: Inputs, goals: Goals, embedder: EpisodeEmbedder
-    ) -> tuple[DistanceNormalizer | None, Value | None, str]:
-        """Return the normalizer, the value beside it, and which ones these are, for people."""
+    ) -> tuple[DistanceNormalizer | None, Value | None, str, Path | None]:
+        """Return the normalizer, the value beside it, which ones these are, and their folder."""
         if self._choice == "none":
-            return None, None, "normalizer: none, raw cosine distances"
+            return None, None, "normalizer: none, raw cosine distances", None
         if (given := self._given) is not None:
             if reason := _mismatch(given, goals, embedder):
                 raise UserError(f"{self._name} does not apply here: {reason}; {REMEDY}")
@@ -275,20 +308,35 @@ class Reward:
             if reason:
                 raise UserError(f"{reason}; {VALUE_REMEDY}")
             beside = "" if value is None else ", with the value beside it"
-            return given, value, f"normalizer: {self._name}{beside}"
+            return given, value, f"normalizer: {self._name}{beside}", self._folder
         folder = self._touch_encoder(inputs)[1]
         scene = inputs.scene if self._choice is None else None
         found, reason = _normalizer_in(folder, scene, goals, embedder)
         if found is None and self._choice == "encoder":
             raise UserError(f"the encoder's normalizer does not apply: {reason}; {REMEDY}")
         if found is None:
-            return None, None, f"raw cosine distances, for {reason}; to normalise them: {_FIT}"
+            note = f"raw cosine distances, for {reason}; to normalise them: {_FIT}"
+            return None, None, note, None
         value, why_not = _value_in(folder, inputs, embedder)
         beside = "" if value is None else ", with the value beside it"
         without = f"; without the value, for {why_not}" if why_not else ""
-        return found, value, f"normalizer: {reason}{beside}{without}"
+        return found, value, f"normalizer: {reason}{beside}{without}", folder
 
-    def _measure_episode(self, episode: Episode, camera: str, fps: float, scene: str) -> Curves:
+    def _embed_set(
+        self, recording: EpisodeSet | str | Path, camera: str
+    ) -> Iterator[tuple[PreparedReward, EmbeddedEpisode]]:
+        opened = isinstance(recording, EpisodeSet)
+        root, keys = (recording.root, recording.keys) if opened else (Path(recording), None)
+        source = open_source(root, camera, keys=keys)
+        if source.skipped:
+            raise UserError(source.skipped[0].reason)
+        prepared = self.prepare_source(source)
+        for t in source.trajectories:
+            yield prepared[t.name], embed_trajectory(prepared[t.name].embedder, t)
+
+    def _embed_episode(
+        self, episode: Episode, camera: str, fps: float, scene: str
+    ) -> tuple[PreparedReward, EmbeddedEpisode]:
         sensor = episode.meta.get("sensor")
         if sensor is None and scene == _ARRAYS and self._encoder is None:
             sensor = pretrained.DEFAULT_ENCODER.name
@@ -307,7 +355,7 @@ class Reward:
             for goal in self.goals
         ]
         prepared = self.prepare(inputs, goals)
-        return prepared.curves(prepared.embedder.embed_episode(episode, fps, inputs.name))
+        return prepared, prepared.embedder.embed_episode(episode, fps, inputs.name)
 
 
 def _as_episode(

@@ -8,6 +8,7 @@
     centre          (n, sides, 2)  centre of the contact, m from the image's middle, x and y
     slip            (n, sides)     m, see `SlipMeter`
     wrench          (n, 6)         external force N and torque Nm, base frame
+    tcp_pose        (n, 7)         xyz m, quaternion wxyz, base frame
     image           (n, d)         pooled features of the measured camera; or a sentence as its goal
     text            (n, k)         sentence, comparable with touch; text_baseline: the one against it
 
@@ -24,7 +25,7 @@ from zipfile import BadZipFile
 import numpy as np
 from jaxtyping import Float32
 
-from touchgoal.control.features import IMAGE_PREFIX
+from touchgoal.control.features import IMAGE_PREFIX, TCP_POSE, WRENCH
 from touchgoal.episodes.schema import MetaValue
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
@@ -37,7 +38,9 @@ Features = Mapping[str, np.ndarray]
 IMAGE, TOUCH, TEXT, TEXT_BASELINE = "image", "touch", "text", "text_baseline"
 FINGERTIPS = (TOUCH, "held", "force", "centre", "slip")
 """Parts with an axis of fingertips."""
-_TOUCHED = (*FINGERTIPS, "wrench")  # parts that the goal of touch sets
+ARM = {"wrench": WRENCH, "tcp_pose": TCP_POSE}
+"""Parts that the arm measures, and their keys."""
+_TOUCHED = (*FINGERTIPS, *ARM)  # parts that the goal of touch sets
 _MAP = "_map"
 
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.arrays import Images
-from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT, WRENCH
+from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT
 from touchgoal.control.tactile.background import first_steady, untouched_frames
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
@@ -23,6 +23,7 @@ from touchgoal.episodes.touches import check_touch, touch_background
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
 from touchgoal.rewards.features.contact_reading import ContactReader, ContactSearch
 from touchgoal.rewards.features.embedded import (
+    ARM,
     IMAGE,
     TEXT,
     TEXT_BASELINE,
@@ -57,7 +58,7 @@ from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
 
 Frames = Mapping[str, np.ndarray]
-"""Frames by key, (n, ...) each; keys other than cameras, fingertips and wrench are ignored."""
+"""Frames by key, (n, ...) each; keys other than cameras, fingertips and `ARM` are ignored."""
 
 
 class EpisodeEmbedder:
@@ -322,8 +323,8 @@ class FeatureStream:
         if self._readers:
             readings = [reader.read(frames[side]) for side, reader in self._readers.items()]
             features |= {k: np.stack([r[k] for r in readings], axis=1) for k in readings[0]}
-        if self._embedder.parts and WRENCH in frames:
-            features["wrench"] = frames[WRENCH]
+        if self._embedder.parts:
+            features |= {name: frames[key] for name, key in ARM.items() if key in frames}
         return replace(self._about, features=features)
 
     def _embed_touch(

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT, WRENCH
+from touchgoal.control.features import CAMERAS, FRONT, TACTILE, TRUTH_CONTACT
 from touchgoal.episodes.faults import find_faults
 from touchgoal.episodes.schema import Episode, is_camera, is_image
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.rewards.distance.normalizer import scene_of
+from touchgoal.rewards.features.embedded import ARM
 from touchgoal.rewards.goals import Bank, GoalSpec, Inputs, OwnFrame, missing_camera
 from touchgoal.rewards.sources.trajectory import Skipped, Source, Trajectory, frames_per_chunk
 from touchgoal.runtime.errors import UserError
@@ -62,7 +63,7 @@ def open_episodes(
     camera = _find_camera(episodes, camera, bool(touch))
     cameras = tuple(key for key in dict.fromkeys((*CAMERAS, camera)) if key in episodes.features)
     read = tuple(
-        key for key in (*cameras, *touch, TRUTH_CONTACT, WRENCH) if key in episodes.features
+        key for key in (*cameras, *touch, TRUTH_CONTACT, *ARM.values()) if key in episodes.features
     )
     found = _trajectories(episodes, chosen, read)
     sensors = {str(t.meta["sensor"]) for t in found if t.meta.get("sensor")}

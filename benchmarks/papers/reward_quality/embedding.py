@@ -9,11 +9,11 @@ from pathlib import Path
 import torch
 
 from benchmarks.papers.reward_quality.recording import Recorded
-from touchgoal.control.features import CAMERAS, TACTILE, TRUTH_CONTACT, WRENCH
+from touchgoal.control.features import CAMERAS, TACTILE, TRUTH_CONTACT
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.rewards.features.embedded import EmbeddedEpisode
+from touchgoal.rewards.features.embedded import ARM, EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.parallel.parallel_map import parallel_map
@@ -62,7 +62,11 @@ def _embed(files: EmbeddedFiles, recorded: Recorded) -> bytes:
     torch.set_num_threads(1)
     episodes = EpisodeSet(recorded.root)
     i, embedder = recorded.index, load_embedder(files.encoder)
-    keys = [key for key in (*CAMERAS, *TACTILE, TRUTH_CONTACT, WRENCH) if key in episodes.features]
+    keys = [
+        key
+        for key in (*CAMERAS, *TACTILE, TRUTH_CONTACT, *ARM.values())
+        if key in episodes.features
+    ]
     frames = range((episodes.lengths[i] - 1) % files.every, episodes.lengths[i], files.every)
     episode, name = episodes.read(i, keys, frames), f"{recorded.root.name}#{i}"
     embedded = embedder.embed_episode(episode, episodes.fps / files.every, name)

@@ -1,0 +1,52 @@
+"""Outcomes of episodes as a judge or a person told them later, kept in the set's folder in `judged.json`.
+
+They are never mixed with the outcome that a person or a simulator recorded (meta `success`). A run that a
+judge ended tells its verdict in meta `judged`, which this file overrides.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
+
+JUDGED = "judged.json"
+Verdict = Literal["success", "failure", "unsure"]
+
+
+@dataclass(frozen=True)
+class JudgedOutcome:
+    """What is said of one episode."""
+
+    verdict: Verdict
+    by: Literal["judge", "person"] = "judge"
+    cost: float | None = None  # of the end, in [0, 1], by the judge
+    reasons: tuple[str, ...] = ()
+
+
+def read_judged(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
+    """Return the judged outcomes of a set by episode; UserError: the file is damaged."""
+    told = {i: episodes.meta(i).get("judged") for i in range(len(episodes))}
+    found: dict[int, Any] = {i: JudgedOutcome(v) for i, v in told.items() if v}  # pyright: ignore[reportArgumentType]
+    path = episodes.root / JUDGED
+    if not path.is_file():
+        return found
+    try:
+        rows = json.loads(path.read_text())
+        return found | {
+            int(i): JudgedOutcome(**{**row, "reasons": tuple(row["reasons"])})
+            for i, row in rows.items()
+        }
+    except (ValueError, TypeError, AttributeError, KeyError):
+        raise UserError(f"{path} is damaged: delete it and judge the set again") from None
+
+
+def write_judged(episodes: EpisodeSet, outcomes: Mapping[int, JudgedOutcome]) -> None:
+    """Write outcomes beside those that the set's file has already, atomically."""
+    path = episodes.root / JUDGED
+    rows = json.loads(path.read_text()) if path.is_file() else {}
+    rows |= {str(i): asdict(outcome) for i, outcome in outcomes.items()}
+    write_file(path, (json.dumps(rows, indent=1) + "\n").encode())

@@ -1,0 +1,131 @@
+"""Judge of episodes: success, failure, or unsure, by how things rest at the end (`end_state`).
+
+Two limits of the end's cost, by split conformal prediction (Vovk et al. 2005; Angelopoulos and Bates 2021,
+arXiv 2107.07511) from known successes and failures that fitted nothing else: at most 10 % of successes
+are called failures, at most 10 % of failures successes. Between the limits a judge is unsure. Without 20
+failures, which must be made on purpose, success is told only up to the stricter cost that two in five
+successes exceed; how many failures pass is then unknown.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
+
+FIT_JUDGE = "fit one with touchgoal fit-normalizer --judge"
+JUDGE = "judge.json"
+"""Name of the file, beside the normalizer."""
+Verdict = Literal["success", "failure", "unsure"]
+WRONG = 0.1  # bound on the share of successes called failures, and of failures called successes
+_DOUBTED = 0.4  # share of successes that are not called so where failures are missing
+LEAST_SUCCESSES, LEAST_FAILURES = 9, 20
+
+_FAR = 0.5  # cost of a part that is named as a reason: 1.5 spreads of successes
+_SAYS = {
+    "value": "the images do not look done",
+    "wrist": "the wrist camera does not see what it sees at the end of successes",
+    "wrist_map": "the wrist camera sees something out of place",
+    "worst": "the wrist camera sees something out of place",
+    "object": "what was carried feels otherwise",
+    "slip": "it slipped in the hand",
+    "held": "the fingertips touch otherwise than at the end of successes",
+}
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a judge says of one episode."""
+
+    verdict: Verdict
+    cost: float  # of the end, in [0, 1]
+    parts: Mapping[str, float]  # cost of each part, see `end_state`
+    reasons: tuple[str, ...]  # what differs most from successes, worst first
+
+    def __str__(self) -> str:
+        reasons = f": {'; '.join(self.reasons)}" if self.reasons else ""
+        return f"{self.verdict} (cost {self.cost:.2f}){reasons}"
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Costs of known ends, and the limits that follow from them."""
+
+    successes: tuple[float, ...]  # costs of ends of successes
+    failures: tuple[float, ...] = ()  # and of failures, made on purpose or corrected by a person
+
+    def __post_init__(self) -> None:
+        """Raise UserError if there are too few successes."""
+        if len(self.successes) < LEAST_SUCCESSES:
+            raise UserError(
+                f"a judge needs at least {LEAST_SUCCESSES} successes that fitted nothing else, these "
+                f"are {len(self.successes)}"
+            )
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Largest cost of what is called success, and least cost of what is called failure."""
+        refuse = _quantile(self.successes, WRONG)
+        if len(self.failures) < LEAST_FAILURES:
+            return min(_quantile(self.successes, _DOUBTED), refuse), refuse
+        accept = -_quantile([-cost for cost in self.failures], WRONG)
+        middle = (accept + refuse) / 2
+        return (accept, refuse) if accept < refuse else (middle, middle)
+
+    def verdict(self, cost: float) -> Verdict:
+        """Return what an end of this cost is called."""
+        accept, refuse = self.limits
+        return "success" if cost <= accept else "failure" if cost > refuse else "unsure"
+
+    def judge(self, parts: Mapping[str, float], cost: float) -> Judgement:
+        """Return the judgement of an end."""
+        worst = sorted(parts, key=lambda name: -parts[name])
+        return Judgement(
+            self.verdict(cost), cost, parts, tuple(_SAYS[n] for n in worst if parts[n] > _FAR)
+        )
+
+    def corrected(self, cost: float, success: bool) -> "Judge":
+        """Return the judge with one more known end."""
+        if success:
+            return Judge((*self.successes, cost), self.failures)
+        return Judge(self.successes, (*self.failures, cost))
+
+    def __str__(self) -> str:
+        return (
+            f"judge of {len(self.successes)} successes and {len(self.failures)} failures: at most "
+            f"{WRONG:.0%} of such successes are called failures, and "
+            + (
+                f"at most {WRONG:.0%} of such failures successes"
+                if len(self.failures) >= LEAST_FAILURES
+                else f"how many failures are called successes is unknown: show it {LEAST_FAILURES}"
+            )
+        )
+
+    def save(self, path: Path) -> None:
+        """Write JSON, atomically."""
+        write_file(path, (json.dumps(asdict(self), indent=2) + "\n").encode())
+
+    @classmethod
+    def load(cls, path: Path) -> "Judge":
+        """Read what `save` wrote; UserError: no such file, or another one."""
+        try:
+            content = json.loads(path.read_text())
+            if content.keys() != {field.name for field in fields(cls)}:
+                raise ValueError
+            return cls(
+                tuple(map(float, content["successes"])), tuple(map(float, content["failures"]))
+            )
+        except (OSError, ValueError, TypeError, AttributeError):
+            raise UserError(f"{path} is no judge: {FIT_JUDGE}") from None
+
+
+def _quantile(costs: Sequence[float], beyond: float) -> float:
+    """Return the ceil((k + 1)(1 - beyond))-th smallest cost, the largest if there are too few."""
+    rank = math.ceil(round((len(costs) + 1) * (1 - beyond), 9))
+    return float(np.sort(costs)[min(rank, len(costs)) - 1])
