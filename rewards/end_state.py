@@ -1,23 +1,34 @@
 """How things rest at the end of an episode: the parts of a cost, each read in the phase where it counts.
 
 What is held and how far it slipped mean something until it is put down: they are read at the last frame
-before. Where things are, and whether they are held, is read at the end.
+before. Where things are, whether they are held, whether they were put down, and how hard the arm presses
+are read at the end. Beside a wrist camera the others are left to the value: where things go varies.
 """
 
 from collections.abc import Mapping
 
 import numpy as np
 
-from touchgoal.rewards.distance.parts import VALUE, VALUE_SHARE, part_costs
-from touchgoal.rewards.features.embedded import Features, split_features, take_rows
+from touchgoal.rewards.curves import UNITS_AT_HALF
+from touchgoal.rewards.distance.parts import VALUE, part_costs
+from touchgoal.rewards.features.embedded import (
+    PUT_DOWN,
+    Features,
+    cameras_of,
+    split_features,
+    take_rows,
+)
 from touchgoal.rewards.value import Value
 
 CARRIED = ("object", "slip")
 """Parts that are read before the object is put down."""
-RESTING = ("wrist", "wrist_map", "worst", "held")
-"""Parts that are read at the end."""
+RESTING = ("wrist", "wrist_map", "held")
+"""Parts that are read at the end, beside the value."""
 _DESCENT = 0.02  # m of the hand, the last ones of which may end with a put-down
 _LEVEL_SECONDS = 0.4  # s of carrying before, whose median wrench is that of the carried object
+_REST = 0.5  # s at the end over which the arm's force is taken
+_SOFT = 5.0  # N: pressing less costs nothing
+_FIRMER = 0.7  # log of the force's ratio that counts as a spread of successes
 _TABLE = 1.0  # N of change of the wrench by which the table takes the object
 
 
@@ -58,22 +69,34 @@ def end_costs(
         value: of the task, if there is one.
     """
     seen, felt = split_features(features)
-    seen = take_rows(seen, slice(-1, None))
-    end = {**seen, **take_rows(felt, slice(-1, None))}
-    costs = {k: float(c[0]) for k, c in part_costs(end, goal, units).items() if k in RESTING}
+    seen, rest = take_rows(seen, slice(-1, None)), take_rows(felt, slice(-1, None))
     before = put_down(felt, fps)
-    row = len(next(iter(felt.values()), ())) - 1 if before is None else max(before - 1, 0)
-    carried = part_costs(take_rows(felt, slice(row, row + 1)), goal, units)
-    costs |= {k: float(c[0]) for k, c in carried.items() if k in CARRIED}
+    at = len(next(iter(felt.values()), ())) - 1 if before is None else max(before - 1, 0)
+    carried = take_rows(felt, slice(at, at + 1))
+    resting = RESTING if "wrist" in goal else (*cameras_of(goal), *RESTING)
+    costs = _some(part_costs({**seen, **rest}, goal, units), resting)
+    costs |= _some(part_costs(carried, goal, units), CARRIED)
     if value is not None:
         costs[VALUE] = 1 - float(value.progress(seen)[0])
+    if PUT_DOWN in goal and goal[PUT_DOWN].mean() > 0.5:
+        costs[PUT_DOWN] = float(before is None)
+    if "wrench" in goal and "wrench" in felt:
+        costs["press"] = _press(felt, fps, goal)
     return costs
 
 
 def end_cost(costs: Mapping[str, float]) -> float:
-    """Return the cost of an end: a share of the value's, the rest the root mean square of the parts."""
-    parts = [cost for name, cost in costs.items() if name != VALUE]
-    fused = float(np.sqrt(np.mean(np.square(parts)))) if parts else costs[VALUE]
-    if VALUE not in costs:
-        return fused
-    return VALUE_SHARE * costs[VALUE] + (1 - VALUE_SHARE) * fused
+    """Return the cost of an end: the root mean square of its parts."""
+    return float(np.sqrt(np.mean(np.square(list(costs.values())))))
+
+
+def _some(costs: Mapping[str, np.ndarray], names: tuple[str, ...]) -> dict[str, float]:
+    return {name: float(costs[name][0]) for name in names if name in costs}
+
+
+def _press(felt: Features, fps: float, goal: Features) -> float:
+    """Return what it costs that the arm presses harder at the end than successes do."""
+    forces = [np.linalg.norm(f["wrench"][:, :3], axis=1).astype(float) for f in (felt, goal)]
+    now, usual = np.median(forces[0][-max(1, round(_REST * fps)) :]), max(_SOFT, forces[1].max())
+    over = max(0.0, float(np.log((1 + now) / (1 + usual)))) / (UNITS_AT_HALF * _FIRMER)
+    return over**2 / (over**2 + 1)

@@ -1,4 +1,4 @@
-"""Demonstrations of mixed quality: by the feedback expert, without a mistake or with one."""
+"""Demonstrations of mixed quality, without a mistake or with one: by the feedback expert, by a led hand."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,8 +9,13 @@ from jaxtyping import Float
 
 from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
 from benchmarks.papers.reward_quality.recording import Recorded
+from touchgoal.control.deployment.scripted import PickPlacePoses
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.teleoperation.config import TeleoperationConfig
+from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
+from touchgoal.control.teleoperation.teleoperator import Teleoperator
 from touchgoal.episodes.recording import EpisodeSpec, collect, missing_specs
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime import seeds
@@ -20,12 +25,15 @@ from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 
-Mistake = Literal["none", "beside", "above", "drop", "freeze"]
+Mistake = Literal["none", "beside", "above", "drop", "freeze", "off"]
 """Mistake of a demonstration, in this order: none; the object is put down 4 to 8 cm beside the goal; the
-hand closes 5 to 8 cm above the object; it lets go on the way; it stops somewhere."""
+hand closes 5 to 8 cm above the object; it lets go on the way; it stops somewhere; the object is put down
+2.5 to 3 cm beside the goal."""
 _RIGHT: tuple[Mistake, ...] = ("none",)
 _MISTAKES: tuple[Mistake, ...] = ("beside", "above", "drop", "freeze")
 _TWENTY: tuple[Mistake, ...] = (*_RIGHT * 8, *_MISTAKES * 3)  # eight of twenty are right
+_LED_TWENTY: tuple[Mistake, ...] = (*_RIGHT * 8, *("beside", "off", "above", "off") * 3)
+_LED_SECONDS = 30.0  # s that a led hand has
 _DISTURBANCE = 0.01  # m/s, so that corrections are shown
 _CARRIED = (0.5, 1.5)  # s between grasp and letting go
 _STOPS = (1.0, 4.0)  # s from the start
@@ -52,12 +60,7 @@ class MistakenExpert(Actor):
         rng, hz = env.np_random.spawn(1)[0], env.config.control_hz
         self._env, self._mistake = env, mistake
         self._ticks_left = round(hz * rng.uniform(*(_CARRIED if mistake == "drop" else _STOPS)))
-        object_error, goal_error = np.zeros(3), np.zeros(3)
-        if mistake == "above":
-            object_error[2] = rng.uniform(0.05, 0.08)
-        if mistake == "beside":
-            angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(0.04, 0.08)
-            goal_error[:2] = distance * np.array([np.cos(angle), np.sin(angle)])
+        object_error, goal_error = _errors(mistake, rng)
         self._expert = FeedbackExpert(env, object_error, goal_error)
         self._last = np.append(np.zeros(env.n_joints), GRIPPER_MAX_WIDTH)
 
@@ -73,6 +76,47 @@ class MistakenExpert(Actor):
 
     def _holds(self) -> bool:
         return all(pad.touching for pad in self._env.pad_contacts())
+
+
+class LedHand(Actor):
+    """The scripted teleoperation device with one mistake; it lets go at the end."""
+
+    def __init__(self, env: PickPlace, mistake: Mistake, seed: int) -> None:
+        """Begin an episode right after its reset."""
+        object_error, goal_error = _errors(mistake, env.np_random.spawn(1)[0])
+        layout = env.scene_layout()
+        grasp = np.array(layout["grasp"]) + np.append(object_error, 0)
+        goal = np.array(layout["goal"]) + goal_error[:2]
+        poses = PickPlacePoses(tuple(grasp), tuple(goal))
+        safety = ActionFilter(env.robot, env.config.control_hz)
+        device = ScriptedDevice(poses, seed)
+        self._hand = Teleoperator(device, safety, lambda: env.command, TeleoperationConfig())
+        self._begun = False
+
+    def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
+        """Return the next action."""
+        if not self._begun:
+            self._hand.start(observation)
+            self._begun = True
+        return self._hand.act(observation)
+
+
+def led_hand(env: Any, spec: EpisodeSpec) -> tuple[LedHand, LedHand]:
+    """Return one hand for both roles of a recording; its mistakes are taken in turn by the seed."""
+    hand = LedHand(env, _LED_TWENTY[spec.seed % len(_LED_TWENTY)], spec.seed)
+    return hand, hand
+
+
+def _errors(mistake: Mistake, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much (m) a mistake misses the object, and the goal."""
+    object_error, goal_error = np.zeros(3), np.zeros(3)
+    if mistake == "above":
+        object_error[2] = rng.uniform(0.05, 0.08)
+    if mistake in ("beside", "off"):
+        near = (0.04, 0.08) if mistake == "beside" else (0.025, 0.03)
+        angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(*near)
+        goal_error[:2] = distance * np.array([np.cos(angle), np.sin(angle)])
+    return object_error, goal_error
 
 
 def record_mixed(

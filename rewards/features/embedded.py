@@ -40,7 +40,9 @@ FINGERTIPS = (TOUCH, "held", "force", "centre", "slip")
 """Parts with an axis of fingertips."""
 ARM = {"wrench": WRENCH, "tcp_pose": TCP_POSE}
 """Parts that the arm measures, and their keys."""
-_TOUCHED = (*FINGERTIPS, *ARM)  # parts that the goal of touch sets
+PUT_DOWN = "put_down"
+"""Of goals: whether what was held was put down, (n,)."""
+_TOUCHED = (*FINGERTIPS, *ARM, PUT_DOWN)  # parts that the goal of touch sets
 _MAP = "_map"
 
 

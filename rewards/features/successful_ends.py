@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
+from touchgoal.rewards.end_state import put_down
 from touchgoal.rewards.features import embedded
+from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
 
 GOAL_FILE = "goal.npz"
@@ -26,10 +28,12 @@ class SuccessfulEnds:
 
     @classmethod
     def of(cls, episodes: Sequence[embedded.EmbeddedEpisode]) -> "SuccessfulEnds":
-        """Take the last frame of each of some episodes that were embedded alike."""
-        return cls(
-            embedded.last_rows(episodes), tuple(e.object for e in episodes), episodes[0].made_with
-        )
+        """Take the end of each of some episodes that were embedded alike, whole or only their ends."""
+        ends = dict(embedded.last_rows(episodes))
+        if len(episodes[0]) > START_FRAMES + 1:
+            down = [put_down(e.features, e.fps) is not None for e in episodes]
+            ends[embedded.PUT_DOWN] = np.array(down)
+        return cls(ends, tuple(e.object for e in episodes), episodes[0].made_with)
 
     def for_trajectory(self, own: embedded.EmbeddedEpisode, what: str) -> embedded.Features:
         """Return the ends with the trajectory's object, all if objects are unknown here or there.
