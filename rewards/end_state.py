@@ -3,16 +3,26 @@
 What is held and how far it slipped mean something until it is put down: they are read at the last frame
 before. Where things are, whether they are held, whether they were put down, and how hard the arm presses
 are read at the end. Beside a wrist camera the others are left to the value: where things go varies.
+
+    value         1 - the progress that a `Value` sees
+    scene         the wrist camera's map, each cell against the same cell of the likest success, whatever its
+                  object: the cells that no success resembles (as PatchCore does, arXiv 2106.08265)
+    put_down      whether something was put down, if successes put something down
+    press         how much harder the arm presses than successes do; 5 N are always allowed
+
+The others are parts of `distance.parts`. Value and scene, which tell places, have two fifths of the cost.
 """
 
 from collections.abc import Mapping
 
 import numpy as np
+from jaxtyping import Float16
 
 from touchgoal.rewards.curves import UNITS_AT_HALF
-from touchgoal.rewards.distance.parts import VALUE, part_costs
+from touchgoal.rewards.distance.parts import VALUE, part_costs, unit_map
 from touchgoal.rewards.features.embedded import (
     PUT_DOWN,
+    SCENE_MAP,
     Features,
     cameras_of,
     split_features,
@@ -22,8 +32,10 @@ from touchgoal.rewards.value import Value
 
 CARRIED = ("object", "slip")
 """Parts that are read before the object is put down."""
-RESTING = ("wrist", "wrist_map", "held")
-"""Parts that are read at the end, beside the value."""
+RESTING = ("wrist", "held")
+"""Parts that are read at the end, beside those above."""
+PLACE, _PLACE_SHARE = (VALUE, "scene"), 0.4
+_WORST, _SCENE_UNIT = 0.05, 0.36  # share of the cells; their distance between successes (90 %)
 _DESCENT = 0.02  # m of the hand, the last ones of which may end with a put-down
 _LEVEL_SECONDS = 0.4  # s of carrying before, whose median wrench is that of the carried object
 _REST = 0.5  # s at the end over which the arm's force is taken
@@ -78,6 +90,8 @@ def end_costs(
     costs |= _some(part_costs(carried, goal, units), CARRIED)
     if value is not None:
         costs[VALUE] = 1 - float(value.progress(seen)[0])
+    if "wrist_map" in goal and "wrist_map" in seen:
+        costs["scene"] = _scene(seen["wrist_map"], goal.get(SCENE_MAP, goal["wrist_map"]))
     if PUT_DOWN in goal and goal[PUT_DOWN].mean() > 0.5:
         costs[PUT_DOWN] = float(before is None)
     if "wrench" in goal and "wrench" in felt:
@@ -86,17 +100,33 @@ def end_costs(
 
 
 def end_cost(costs: Mapping[str, float]) -> float:
-    """Return the cost of an end: the root mean square of its parts."""
-    return float(np.sqrt(np.mean(np.square(list(costs.values())))))
+    """Return the cost of an end: the root mean square of its parts, in which those of place weigh more."""
+    groups = [[c**2 for n, c in costs.items() if (n in PLACE) == place] for place in (True, False)]
+    if not all(groups):
+        return float(np.sqrt(np.mean(np.concatenate(groups))))
+    place, other = map(np.mean, groups)
+    return float(np.sqrt(_PLACE_SHARE * place + (1 - _PLACE_SHARE) * other))
 
 
 def _some(costs: Mapping[str, np.ndarray], names: tuple[str, ...]) -> dict[str, float]:
     return {name: float(costs[name][0]) for name in names if name in costs}
 
 
+def _scene(seen: Float16[np.ndarray, "1 c y x"], known: Float16[np.ndarray, "g c y x"]) -> float:
+    """Return the cost of the cells of a map that are least like the same cell of any success."""
+    mine, theirs = unit_map(seen)[0], unit_map(known)
+    nearest = 1 - np.einsum("cp,gcp->gp", mine, theirs, optimize=True).max(0)
+    worst = np.sort(nearest)[-max(1, round(_WORST * len(nearest))) :].mean()
+    return _cost(worst / _SCENE_UNIT)
+
+
 def _press(felt: Features, fps: float, goal: Features) -> float:
     """Return what it costs that the arm presses harder at the end than successes do."""
     forces = [np.linalg.norm(f["wrench"][:, :3], axis=1).astype(float) for f in (felt, goal)]
     now, usual = np.median(forces[0][-max(1, round(_REST * fps)) :]), max(_SOFT, forces[1].max())
-    over = max(0.0, float(np.log((1 + now) / (1 + usual)))) / (UNITS_AT_HALF * _FIRMER)
-    return over**2 / (over**2 + 1)
+    return _cost(max(0.0, float(np.log((1 + now) / (1 + usual)))) / _FIRMER)
+
+
+def _cost(units: float) -> float:
+    """Return the cost of a distance in units, as the parts have it."""
+    return units**2 / (units**2 + UNITS_AT_HALF**2)

@@ -31,7 +31,7 @@ _FAR = 0.5  # cost of a part that is named as a reason: 1.5 spreads of successes
 _SAYS = {
     "value": "the images do not look done",
     "wrist": "the wrist camera does not see what it sees at the end of successes",
-    "wrist_map": "the wrist camera sees something out of place",
+    "scene": "the wrist camera sees something out of place",
     "put_down": "nothing was put down",
     "press": "the arm presses harder than at the end of successes",
     "object": "what was carried feels otherwise",

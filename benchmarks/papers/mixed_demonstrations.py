@@ -1,5 +1,6 @@
 """Demonstrations of mixed quality, without a mistake or with one: by the feedback expert, by a led hand."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +17,8 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.teleoperator import Teleoperator
-from touchgoal.episodes.recording import EpisodeSpec, collect, missing_specs
+from touchgoal.episodes.recording import EpisodeSpec, Roles, collect, missing_specs
+from touchgoal.episodes.schema import MetaValue
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime import seeds
 from touchgoal.runtime.parallel.parallel_map import Workers
@@ -120,33 +122,66 @@ def _errors(mistake: Mistake, rng: np.random.Generator) -> tuple[np.ndarray, np.
 
 
 def record_mixed(
-    folder: Path, count: int, env: PickPlaceConfig, workers: Workers
+    folder: Path,
+    count: int,
+    env: PickPlaceConfig,
+    workers: Workers,
+    objects: Sequence[str] = HELD_OUT_OBJECTS,
 ) -> list[Recorded]:
     """Record `count` demonstrations, right and wrong; return them with what came of each."""
-    return _record(folder, count, _FIRST_SEED, MixedRoles(), env, workers)
+    first = _FIRST_SEED if objects == HELD_OUT_OBJECTS else _FIRST_SEED + 60_000
+    moved = replace(env, disturbance=_DISTURBANCE)
+    return _record(folder, count, first, MixedRoles(), moved, workers, objects)
 
 
 def record_right(
     folder: Path, count: int, env: PickPlaceConfig, workers: Workers
 ) -> list[Recorded]:
     """Record `count` demonstrations without a mistake, to validate on."""
-    return _record(folder, count, _FIRST_SEED + 50_000, MixedRoles(_RIGHT), env, workers)
+    moved = replace(env, disturbance=_DISTURBANCE)
+    return _record(folder, count, _FIRST_SEED + 50_000, MixedRoles(_RIGHT), moved, workers)
+
+
+def record_led(folder: Path, count: int, env: PickPlaceConfig, workers: Workers) -> list[Recorded]:
+    """Record `count` demonstrations of a led hand, right and wrong."""
+    env = replace(env, release=True, max_seconds=_LED_SECONDS)
+    return _record(folder, count, _FIRST_SEED + 90_000, led_hand, env, workers)
 
 
 def _record(
-    folder: Path, count: int, seed: int, roles: MixedRoles, env: PickPlaceConfig, workers: Workers
+    folder: Path,
+    count: int,
+    seed: int,
+    roles: Roles,
+    env: PickPlaceConfig,
+    workers: Workers,
+    objects: Sequence[str] = HELD_OUT_OBJECTS,
 ) -> list[Recorded]:
-    objects = HELD_OUT_OBJECTS
     specs = [
         EpisodeSpec(seed + k, options={"object": objects[(k + k // 20) % len(objects)]})
         for k in range(count)
     ]
     missing = missing_specs(folder, specs)
     if missing:
-        collect(folder, replace(env, disturbance=_DISTURBANCE), missing, workers, roles)
+        collect(folder, env, missing, workers, roles)
     episodes = EpisodeSet(folder)
-    metas = [episodes.meta(i) for i in range(count)]
+    mistakes = _LED_TWENTY if roles is led_hand else _TWENTY
     return [
-        Recorded(folder, i, "test", str(meta["outcome"]), str(meta["object"]), "elsewhere")
-        for i, meta in enumerate(metas)
+        Recorded(
+            folder,
+            i,
+            "test",
+            _kind(episodes.meta(i), mistakes),
+            str(episodes.meta(i)["object"]),
+            "elsewhere",
+        )
+        for i in range(count)
     ]
+
+
+def _kind(meta: Mapping[str, MetaValue], mistakes: Sequence[Mistake]) -> str:
+    """Return "success", or the mistake of a demonstration that failed."""
+    mistake = mistakes[int(str(meta["seed"])) % len(mistakes)]
+    if meta["success"]:
+        return "success"
+    return "failure" if mistake == "none" else mistake

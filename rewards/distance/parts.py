@@ -98,9 +98,9 @@ def map_distances(
 
     What is out of place fills a few cells, which a mean over all of them hides.
     """
-    theirs, n = _unit_map(goals), max(1, round(_WORST_CELLS * goals.shape[2] * goals.shape[3]))
+    theirs, n = unit_map(goals), max(1, round(_WORST_CELLS * goals.shape[2] * goals.shape[3]))
     chunks = [
-        np.einsum("ncp,gcp->ngp", _unit_map(mine[i : i + _CHUNK]), theirs, optimize=True)
+        np.einsum("ncp,gcp->ngp", unit_map(mine[i : i + _CHUNK]), theirs, optimize=True)
         for i in range(0, len(mine), _CHUNK)
     ]
     return 1 - np.partition(np.concatenate(chunks), n - 1)[..., :n].mean(-1)
@@ -214,7 +214,8 @@ def smooth(
     return lfilter([1 - keep], [1, -keep], cost, zi=[keep * start])[0]
 
 
-def _unit_map(maps: Float16[np.ndarray, "n c y x"]) -> Float[np.ndarray, "n c p"]:
+def unit_map(maps: Float16[np.ndarray, "n c y x"]) -> Float[np.ndarray, "n c p"]:
+    """Return maps with a unit vector at each position, the positions flattened."""
     whole = maps.astype(np.float64)  # float32 would make batch and stream differ by 1e-6
     whole /= np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-6)
     return whole.reshape(*whole.shape[:2], -1)

@@ -40,8 +40,8 @@ FINGERTIPS = (TOUCH, "held", "force", "centre", "slip")
 """Parts with an axis of fingertips."""
 ARM = {"wrench": WRENCH, "tcp_pose": TCP_POSE}
 """Parts that the arm measures, and their keys."""
-PUT_DOWN = "put_down"
-"""Of goals: whether what was held was put down, (n,)."""
+PUT_DOWN, SCENE_MAP = "put_down", "scene_map"
+"""Of goals: whether what was held was put down, (n,); wrist_map of successes with any object."""
 _TOUCHED = (*FINGERTIPS, *ARM, PUT_DOWN)  # parts that the goal of touch sets
 _MAP = "_map"
 

@@ -52,10 +52,14 @@ class SuccessfulEnds:
                     f"goal '{what}' has no end with {own.object}, only with {', '.join(known)}: add "
                     "a success with it"
                 )
-        rows = np.flatnonzero(fits & ~self._ends_of(own))
+        others = ~self._ends_of(own)
+        rows = np.flatnonzero(fits & others)
         if not len(rows):
             raise UserError(f"goal '{what}' holds the end of {own.source} alone: add a success")
-        return embedded.take_rows(self.features, rows)
+        goal = dict(embedded.take_rows(self.features, rows))
+        if "wrist_map" in goal:
+            goal[embedded.SCENE_MAP] = self.features["wrist_map"][others]
+        return goal
 
     def _ends_of(self, own: embedded.EmbeddedEpisode) -> Bool[np.ndarray, " ends"]:
         """Return which ends are the last frame of a trajectory."""
