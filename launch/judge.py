@@ -1,13 +1,11 @@
 """Say of each episode of a set whether it ended in success: success, failure or unsure, and why.
 
-The judge comes from `fit-normalizer --judge`. Verdicts are written into the set (judged.json), beside
-the outcomes that a person or a simulator recorded, which stay as they are. A page shows the ends,
-doubtful ones first. With --correct a person decides them: that counts in the set from then on, and the
-judge learns from it.
+Verdicts are written into the set (judged.json), beside the outcomes that a person or a simulator recorded.
+A page shows the ends, doubtful ones first. With --correct a person decides; that counts in the set from
+then on, and the judge learns from it.
 """
 
 import csv
-import io
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import RARE, checked_dataclass
 
@@ -42,9 +40,6 @@ class Config:
     observation.images.top=observation.images.front."""
     encoder: str | None = None
     """Touch encoder that the judge was fitted with. Default: the one that ships for the episodes' sensor."""
-    towers: str | None = None
-    """Image and text networks that the judge was fitted with. If given without --encoder, only images
-    are measured."""
     out: Path | None = None
     """Folder of the run."""
 
@@ -68,14 +63,12 @@ def main(config: Config) -> None:
 
     if config.correct and (sys.stdin is None or not sys.stdin.isatty()):
         raise UserError("--correct asks a person: run it in a terminal")
-    with_touch, keys = config.towers is None or config.encoder is not None, parse_keys(config.keys)
-    source = open_source(config.source, "front", (), with_touch, keys=keys)
+    source = open_source(config.source, "front", keys=parse_keys(config.keys))
     trajectories = [t for t in source.trajectories if isinstance(t, EpisodeTrajectory)]
     if not trajectories:
         raise UserError(f"{config.source} is no set of episodes: give one")
-    goal, normalizer = GoalFile(config.judge / GOAL_FILE), config.judge / NORMALIZER
-    reward = Reward(goal, encoder=config.encoder, towers=config.towers, normalizer=normalizer)
-    prepared = reward.prepare(source.inputs)
+    goal, units = GoalFile(config.judge / GOAL_FILE), config.judge / NORMALIZER
+    prepared = Reward(goal, encoder=config.encoder, normalizer=units).prepare(source.inputs)
     judge, episodes = prepared.judge, trajectories[0].episodes
     told = {i: one for i, one in read_judged(episodes).items() if one.by == "person"}
     out = open_run(config.out, "judge", config)
@@ -87,12 +80,9 @@ def main(config: Config) -> None:
             skipped.append(Skipped(t.name, str(error)))
     if not said:
         raise UserError(f"nothing could be judged: {skipped[0].reason}")
-    summary = write_skipped(skipped, len(said) + len(skipped), out)
+    print(write_skipped(skipped, len(said) + len(skipped), out))
     ends = _report(said, told, judge, out)
-    if skipped:
-        print(summary)
-    answers = _ask(ends) if config.correct else ()
-    for end, success in answers:
+    for end, success in _ask(ends) if config.correct else ():
         verdict, i = "success" if success else "failure", end.trajectory.index
         told[i] = JudgedOutcome(verdict, "person", end.said.cost)
         write_judged(episodes, {i: told[i]})
@@ -123,9 +113,8 @@ def _report(
         about = [str(end.trajectory.index), end.outcome.verdict, end.outcome.by, end.recorded]
         costs = [f"{cost:.4f}" for cost in (end.said.cost, *end.said.parts.values())]
         rows.append([*about, *costs, "; ".join(end.said.reasons)])
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    write_file(out / "judged.csv", text.getvalue().encode())
+    with atomic_write(out / "judged.csv") as unfinished, unfinished.open("w") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
     table = f"{judge}\n\n{_table(ends)}"
     print(f"{table}\npage: {write_judged_page(ends, table, out)}")
     return ends

@@ -65,7 +65,7 @@ def test_fitted_judged_and_corrected(
 ) -> None:
     """Images alone; a person's word stays when the set is judged again."""
     pytest.importorskip("transformers")
-    episode, fit = recorded(), ("fit-normalizer", "set", "--towers", "offline", "--judge", "--out")
+    episode, fit = recorded(), ("fit-normalizer", "set", "--judge", "--out")
     for k in range(10):
         front = episode.frames[FRONT] + np.uint8(k)
         if k == 9:
@@ -79,7 +79,7 @@ def test_fitted_judged_and_corrected(
                 main([*fit, "few"])
     main([*fit, "fit"])
     assert "of 9 successes and 1 failures" in capsys.readouterr().out
-    judge = ["judge", "set", "--judge", "fit", "--towers", "offline", "--out"]
+    judge = ["judge", "set", "--judge", "fit", "--out"]
     main([*judge, "out"])
     assert "verdicts agree with the recorded outcome" in capsys.readouterr().out
     told = json.loads(Path("set/judged.json").read_text())
