@@ -68,8 +68,8 @@ def test_fitted_judged_and_corrected(
     episode, fit = recorded(), ("fit-normalizer", "set", "--judge", "--out")
     for k in range(10):
         front = episode.frames[FRONT] + np.uint8(k)
-        if k == 9:
-            front[-1] = 0
+        if k < 9:  # done: half of the image has changed
+            front[6:, :, 16:] = (250, 200 - k, 30)
         meta = {"success": k != 9, "object": "cup"}
         EpisodeWriter(here / "set").append(
             Episode({FRONT: front, WRIST: front[:, ::-1].copy()}, "pick", meta)
