@@ -134,7 +134,7 @@ def _table(ends: "Sequence[JudgedEnd]") -> str:
         agree = sum(end.recorded == end.outcome.verdict for end in sure)
         lines.append(f"{agree} of {len(sure)} verdicts agree with the recorded outcome")
     doubted = [e.said.reasons[0] for e in ends if e.said.reasons and e.said.verdict != "success"]
-    lines += ["worst parts of the others:"] if doubted else []
+    lines += ["what differs most in the others:"] if doubted else []
     lines += [f"{n:>5}  {reason}" for reason, n in Counter(doubted).most_common()]
     return "\n".join(lines)
 
