@@ -24,6 +24,7 @@ COMMANDS = {
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "costs and rewards along episodes or plain videos",
     "fit-normalizer": "fit the normalizer of reward-curves on successful episodes of your own",
+    "judge": "tell success from failure by a judge of fit-normalizer, and correct it",
     "record-presses": "record presses of a ball all over a sensor's gel, and calibrate from them",
     "check-sensor": "try a sensor on your own frames: noise, drift, contact, depth, force, markers",
     "calibrate": "fit a sensor's light and gel to presses of a ball",

@@ -4,8 +4,8 @@ Distances to a goal differ in size between cameras, encoders and scenes. This co
 successful episodes usually start and end, for each modality, and how far their ends lie apart, for
 each part of the cost. It writes normalizer.json, and goal.npz: the successful ends as a goal. With
 --value it also learns to see the task's progress in images (value.json, value.safetensors), which
-`reward-curves` uses if it lies beside the normalizer. Any camera works; plain videos work for
-images.
+`reward-curves` uses if it lies beside the normalizer. With --judge it also fits a judge (judge.json),
+by which `touchgoal judge` tells success from failure. Any camera works; plain videos work for images.
 """
 
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from touchgoal.runtime.option_types import RARE, CountOrNone, checked_dataclass
+from touchgoal.runtime.option_types import RARE, checked_dataclass
 
 
 @checked_dataclass
@@ -28,9 +28,9 @@ class Config:
     value: bool = False
     """Also fit a value of the task: a network that reads progress from images, whatever the goal. It
     needs at least 4 successes and a minute or two, and holds for these cameras and towers."""
-    success_from: CountOrNone = 0
-    """Number of successes, the last ones, that fit nothing else and set the threshold of success
-    (success.json): at least 9, for at most 10 % of successes rejected. 0: no threshold."""
+    judge: bool = False
+    """Also fit a judge of success: to at least 9 successes that share their objects, and better to 20
+    failures, too, made on purpose. It fits four more values, if it has one."""
     camera: str = "front"
     """Camera of the plain distance of images, such as front, wrist or a LeRobot set's top."""
     keys: Annotated[tuple[str, ...], RARE] = ()
@@ -53,16 +53,19 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, embed, fit, and write normalizer.json."""
+    from collections import Counter
+
     from touchgoal.episodes.keys import parse_keys
+    from touchgoal.rewards.distance.fit_judge import fit_judge
     from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
     from touchgoal.rewards.distance.normalizer import NORMALIZER
-    from touchgoal.rewards.features.embedding_cache import embed_trajectory
+    from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
     from touchgoal.rewards.goals import Modality
+    from touchgoal.rewards.judge import JUDGE, LEAST_SUCCESSES
     from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.open_source import open_successes
-    from touchgoal.rewards.success import SUCCESS, check_demonstrations, fit_success, last_costs
-    from touchgoal.rewards.value import LEAST_EPISODES, fit_value
+    from touchgoal.rewards.value import fit_value
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.progress import track
     from touchgoal.runtime.provenance import provenance
@@ -71,25 +74,21 @@ def main(config: Config) -> None:
     keys = parse_keys(config.keys)
     with_touch = config.towers is None or config.encoder is not None
     named, success = (config.sources, config.camera), config.assume_success
-    sources = open_successes(*named, with_touch, success, keys, config.background)
+    sources, failures = open_successes(*named, with_touch, success, keys, config.background)
     inputs = sources[0].inputs
     embedder = Reward(encoder=config.encoder, towers=config.towers).embedder(inputs)
     trajectories = [t for source in sources for t in source.trajectories]
-    if config.success_from:
-        check_demonstrations(config.success_from)
-        least = LEAST_EPISODES if config.value else 2
-        if len(trajectories) - config.success_from < least:
-            raise UserError(
-                f"--success-from {config.success_from} leaves fewer than {least} of "
-                f"{len(trajectories)} successes to fit on"
-            )
+    of_object = Counter(str(t.meta.get("object", "")) for t in trajectories)
+    if config.judge and (n := sum(k for k in of_object.values() if k > 1)) < LEAST_SUCCESSES:
+        raise UserError(
+            f"--judge needs at least {LEAST_SUCCESSES} successes, each of an object with another "
+            f"one; there are {n}"
+        )
     out = open_run(config.out, "fit-normalizer", config)
     embedded = [
         embedder.describe(embed_trajectory(embedder, t), t.meta)
         for t in track(trajectories, "embedding", "trajectory")
     ]
-    calibration = embedded[len(embedded) - config.success_from :]
-    embedded = embedded[: len(embedded) - config.success_from]
     own: list[Modality] = [m for m in embedded[0].modalities if m != "text"]
     modalities = config.modalities or own
     normalizer = fit_normalizer(embedded, modalities, inputs.scene)
@@ -109,9 +108,11 @@ def main(config: Config) -> None:
     print("  same episode   the goal is the episode's own last frame, else another's or a sentence")
     units = ", ".join(f"{name} {unit:.3g}" for name, unit in normalizer.unit.items())
     print(f"spread of successful ends by part: {units or 'none, for no two hold the same object'}")
-    if calibration:
-        threshold = fit_success(last_costs(calibration, ends, normalizer, value))
-        threshold.save(out / SUCCESS)
-        print(threshold)
+    if config.judge:
+        failed = [embed_end(embedder, t) for t in track(failures, "embedding failures", "episode")]
+        judge = fit_judge(embedded, failed, value)
+        judge.save(out / JUDGE)
+        print(f"{judge}\nnext: touchgoal judge SET --judge {out}")
+        return
     goal = f"--goal goal:{out / GOAL_FILE} --normalizer {out / NORMALIZER}"
     print(f"next: touchgoal reward-curves {config.sources[0]} {goal}")

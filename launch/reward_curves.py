@@ -84,7 +84,6 @@ def main(config: Config) -> None:
     from touchgoal.rewards.report.report import report_all
     from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.open_source import open_source
-    from touchgoal.rewards.success import load_success_threshold
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.run_folder import open_run
 
@@ -136,9 +135,8 @@ def main(config: Config) -> None:
     summary = write_skipped(skipped, total, out)
     if not measurement.records:
         raise UserError(f"nothing could be measured: {skipped[0].reason}")
-    threshold = None if config.plain else load_success_threshold(config.normalizer)
     audited = source.trajectories[: config.audit]
     audit = audit_trajectories(audited, rewards).table if audited else ""
-    unfit = report_all(measurement.records, out, first.provenance(), threshold, audit)
+    unfit = report_all(measurement.records, out, first.provenance(), audit)
     print(f"{summary}; {speed}")
     print(unfit or f"next: look at {out / PAGE}; train on {out / FRAMES}")

@@ -37,7 +37,7 @@ TOY = {
     "train-encoder surfaces": "--surfaces 16 --presses-per-surface 2",
     "train-policy": "--head tiny --train.epochs 1 --trials 0 --workers 1",
     "record-demos": "--episodes 1 --hand.speed 0.25 --hand.turn-speed 1.5",
-    "fit-normalizer": "--no-value",  # test_commands.py fits one
+    "fit-normalizer": "--no-value --no-judge",  # test_commands.py and test_judge_command.py fit them
     "twin": "--port 0 --lock-step",
 }
 # What is not run here, and where it is, or why not.
@@ -49,6 +49,7 @@ NOT_RUN = {
     "arm": "needs an arm: test_deploy.py",
     "push": "needs a hub: test_hub.py",
     "pull": "needs a hub: test_hub.py",
+    "judge": "needs a judge: test_judge_command.py",
     "demo": "test_commands.py",
 }
 

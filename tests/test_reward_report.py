@@ -14,7 +14,6 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from test_episode_embedder import recorded
-from test_success import facts
 from toy_towers import PaintTowers
 
 from touchgoal.control.features import FRONT, TACTILE_LEFT, WRIST
@@ -31,7 +30,7 @@ from touchgoal.rewards.measure import Measurement, embed_here, write_skipped
 from touchgoal.rewards.metrics import measure_curve
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.plot import CURVES, curve_colors, line_styles, plot
-from touchgoal.rewards.report.record import Record, load_facts, record_of
+from touchgoal.rewards.report.record import Facts, Record, load_facts, record_of
 from touchgoal.rewards.report.report import report_all
 from touchgoal.rewards.report.tables import ends_table, metrics_table, outcome_table
 from touchgoal.rewards.report.thumbnails import Thumbnails
@@ -44,6 +43,15 @@ from touchgoal.runtime.image_file import write_image
 
 EPISODE = recorded()
 REWARD = Reward("last", towers=PaintTowers())
+
+
+def facts(outcome: str, last: float, name: str = "a") -> Facts:
+    return Facts(
+        name=name, source=name, index=0, offset=0, frames=9, fps=20.0, unit="", normalised=True,
+        goal={}, own_goal=False, contact=None, contact_source="no touch", object="",
+        outcome=outcome, success=outcome == "success" if outcome else None,
+        measured={"fused": {"end": last}}, peaks={}, shown=[], columns=[],
+    )  # fmt: skip
 
 
 @pytest.fixture

@@ -127,11 +127,13 @@ class EpisodeEmbedder:
         fps: float,
         source: str,
         untouched: Mapping[str, Images] | None = None,
+        touch: bool = True,
     ) -> EmbeddedEpisode:
         """Embed consecutive chunks of one episode, as `embed_episode` embeds it in one go.
 
         The first chunk has at least 5 frames, unless it is the whole episode. `untouched` holds frames
-        of the fingertips that give their backgrounds in place of its first ones.
+        of the fingertips that give their backgrounds in place of its first ones. Without `touch` their
+        contact alone is read.
         """
         following = iter(chunks)
         first = next(following)
@@ -146,7 +148,7 @@ class EpisodeEmbedder:
         search, pieces = ContactSearch(apart), []
         for chunk in chain([first], following):
             search.update(chunk)
-            pieces.append(stream.embed(chunk.frames))
+            pieces.append(stream.embed(chunk.frames, touch))
         features = join_rows([piece.features for piece in pieces])
         embedded = replace(pieces[0], features=features, contact=search.contact)
         return embedded.with_facts(first.meta)
@@ -314,11 +316,11 @@ class FeatureStream:
             if embedder.parts
         }
 
-    def embed(self, frames: Frames) -> EmbeddedEpisode:
-        """Embed the next frames; the first contact is not looked for."""
+    def embed(self, frames: Frames, touch: bool = True) -> EmbeddedEpisode:
+        """Embed the next frames, on request without touch; the first contact is not looked for."""
         features = dict(self._embedder.embed_cameras(frames))
         sides = self._about.sides
-        if sides:
+        if sides and touch:
             features[TOUCH] = np.stack([self._embed_touch(s, frames[s]) for s in sides], axis=1)
         if self._readers:
             readings = [reader.read(frames[side]) for side, reader in self._readers.items()]

@@ -3,15 +3,25 @@
 import hashlib
 import json
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
+
+from touchgoal.control.features import TACTILE
 from touchgoal.episodes.embedding_files import embedding_file
-from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.schema import Episode, is_camera
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
-from touchgoal.rewards.features.embedded import EmbeddedEpisode, load_features, save_features
+from touchgoal.rewards.end_state import put_down
+from touchgoal.rewards.features.embedded import (
+    TOUCH,
+    EmbeddedEpisode,
+    load_features,
+    save_features,
+)
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
+from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
@@ -34,7 +44,48 @@ def embed_trajectory(
         return _load(path, trajectory)
     chunks = trajectory.chunks() if chunks is None else chunks
     about = trajectory.fps, trajectory.source, trajectory.untouched
-    embedded = embedder.embed_chunks(chunks, *about)
+    return _keep(path, embedder.embed_chunks(chunks, *about))
+
+
+def embed_end(embedder: EpisodeEmbedder, trajectory: EpisodeTrajectory) -> EmbeddedEpisode:
+    """Return what `end_costs` reads of an episode, from a file if there is one.
+
+    That is contact and arm at all frames, cameras at the last one, and the touch embedding at two: the
+    last one, and the one before `put_down`, which stands for all frames until then.
+    """
+    for path in (kept_file(embedder, trajectory), kept_file(embedder, trajectory, "end")):
+        if path is not None and path.is_file():
+            return _load(path, trajectory)
+    last, about = trajectory.length - 1, (trajectory.fps, trajectory.source)
+    end = trajectory.read([last])
+    felt = replace(trajectory, keys=tuple(key for key in trajectory.keys if not is_camera(key)))
+    if embedder.encoder is None or not set(TACTILE) & set(felt.keys):
+        return _keep(path, embedder.embed_chunks([end], *about))
+    contact = embedder.embed_chunks(felt.chunks(), *about, touch=False)
+    down, past = put_down(contact.features, trajectory.fps), max(embedder.encoder.offsets)
+    before = last if down is None else max(down - 1, 0)
+    rows = [*range(min(START_FRAMES, last)), *range(max(before - past, 0), before + 1)]
+    again = felt.read([*rows, *range(max(last - past, 0), last + 1)])
+    touch = embedder.embed_chunks([again], *about).features[TOUCH][[len(rows) - 1, -1]]
+    features = {
+        **embedder.embed_cameras(end.frames),
+        **contact.features,
+        TOUCH: np.repeat(touch, [before + 1, last - before], axis=0),
+    }
+    return _keep(path, replace(contact, features=features))
+
+
+def kept_file(embedder: EpisodeEmbedder, trajectory: Trajectory, *of: str) -> Path | None:
+    """Return the file of an episode's embedding, named by content and encoders; None for videos."""
+    if not isinstance(trajectory, EpisodeTrajectory):
+        return None
+    read = trajectory.keys, sorted(trajectory.episodes.keys.items()), *of
+    made_of = json.dumps([_FORMAT, embedder.fingerprint, read])
+    folder = f"rewards-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
+    return embedding_file(trajectory.episodes, trajectory.index, folder, ".npz")
+
+
+def _keep(path: Path | None, embedded: EmbeddedEpisode) -> EmbeddedEpisode:
     if path is not None:
         about = {
             "contact": asdict(embedded.contact),
@@ -43,16 +94,6 @@ def embed_trajectory(
         }
         save_features(path, embedded.features, about)
     return embedded
-
-
-def kept_file(embedder: EpisodeEmbedder, trajectory: Trajectory) -> Path | None:
-    """Return the file of an episode's embedding, named by content and encoders; None for videos."""
-    if not isinstance(trajectory, EpisodeTrajectory):
-        return None
-    read = trajectory.keys, sorted(trajectory.episodes.keys.items())
-    made_of = json.dumps([_FORMAT, embedder.fingerprint, read])
-    folder = f"rewards-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
-    return embedding_file(trajectory.episodes, trajectory.index, folder, ".npz")
 
 
 def _load(path: Path, trajectory: Trajectory) -> EmbeddedEpisode:

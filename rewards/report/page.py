@@ -152,16 +152,17 @@ def _sheet(sheet: np.ndarray, count: int) -> dict[str, Any]:
     with Image.open(io.BytesIO(sheet.tobytes())) as image:
         columns, rows = min(count, SHEET_COLUMNS), math.ceil(count / SHEET_COLUMNS)
         width, height = image.width // columns, image.height // rows
-    uri = _data_uri(sheet.tobytes())
+    uri = data_uri(sheet.tobytes())
     return {"uri": uri, "columns": columns, "width": width, "height": height}
 
 
 def _thumb(record: Record) -> str:
     sheet = next(iter(record.sheets.values()))
-    return _data_uri(last_of(sheet, len(record.facts.shown)))
+    return data_uri(last_of(sheet, len(record.facts.shown)))
 
 
-def _data_uri(jpeg: bytes) -> str:
+def data_uri(jpeg: bytes) -> str:
+    """Return a JPEG as an address that holds it."""
     return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"
 
 

@@ -20,9 +20,7 @@ from touchgoal.rewards.report.tables import (
     ends_table,
     metrics_table,
     outcome_table,
-    success_table,
 )
-from touchgoal.rewards.success import SuccessThreshold
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.json_file import write_json
 
@@ -57,7 +55,6 @@ def report_all(
     records: Sequence[Path],
     out: Path,
     provenance: Mapping[str, Any],
-    threshold: SuccessThreshold | None = None,
     audit: str = "",
 ) -> str:
     """Write the reports of all records: metrics, tables for LeRobot, pages; print the tables.
@@ -65,7 +62,6 @@ def report_all(
     Return why the reward is not to be trained on, "" if nothing speaks against it.
 
     Args:
-        threshold: what counts as success, if that is known.
         audit: table of the touch-use audit; "" without one.
     """
     facts = [load_facts(path) for path in records]
@@ -77,8 +73,6 @@ def report_all(
     tables = [metrics_table(facts, most=MOST_CURVES), ends_table(facts)]
     if any(one.success is False for one in facts):
         tables.append(outcome_table(facts))
-    if threshold is not None:
-        tables.append(success_table(facts, threshold, out))
     if audit:
         tables.append(audit)
     page = write_pages(records, facts, out, tables[2:])

@@ -22,8 +22,9 @@ _QUALITY = 70  # of JPEG
 class Thumbnails:
     """Evenly spaced frames of each camera and fingertip."""
 
-    def __init__(self, length: int) -> None:
-        """Plan for a trajectory of so many frames."""
+    def __init__(self, length: int, height: int = _HEIGHT) -> None:
+        """Plan for a trajectory of so many frames; `height` in px, at most."""
+        self._height = height
         count = min(length, MOST_FRAMES)
         self.planned: list[int] = np.linspace(0, length - 1, count).round().astype(int).tolist()
         self._images: dict[str, list[np.ndarray]] = {}
@@ -45,7 +46,7 @@ class Thumbnails:
     def add(self, planned: Episode) -> None:
         """Add planned frames; only where the trajectory is not read as a whole, all of them at once."""
         keys = list(filter(is_image, planned.frames))
-        height = _LONE_HEIGHT if len(keys) == 1 else _HEIGHT
+        height = _LONE_HEIGHT if len(keys) == 1 else self._height
         for key in keys:
             small = [_shrunk(image, height) for image in planned.frames[key]]
             self._images.setdefault(key.removeprefix(IMAGE_PREFIX), []).extend(small)

@@ -69,8 +69,8 @@ def open_successes(
     assume_success: bool,
     keys: Mapping[str, str] | None = None,
     background: Sequence[Path] = (),
-) -> list[Source]:
-    """Open the successful episodes of one set, or several plain videos of successes.
+) -> tuple[list[Source], list[EpisodeTrajectory]]:
+    """Open the successful episodes of one set, or several plain videos of successes; and the set's failures.
 
     With `assume_success` episodes without a recorded outcome count. UserError: as `open_source`; no
     source, several sets, or sets and videos; fewer than two successes.
@@ -95,4 +95,5 @@ def open_successes(
         sources = [replace(sources[0], trajectories=chosen)]
     if sum(len(source.trajectories) for source in sources) < 2:
         raise UserError("a normalizer needs at least two successful episodes or videos")
-    return sources
+    failed = [t for t, reached in success.items() if reached is False]
+    return sources, [t for t in failed if isinstance(t, EpisodeTrajectory)]

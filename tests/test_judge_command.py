@@ -1,0 +1,97 @@
+"""A judge is fitted, judges a set and is corrected; what it reads of an episode is read apart."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_episode_embedder import embedder, recorded  # noqa: F401
+from test_reward_parts import embedded
+
+from touchgoal.control.features import FRONT, TACTILE_LEFT, TCP_POSE, WRENCH, WRIST
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeWriter
+from touchgoal.launch.__main__ import main
+from touchgoal.rewards.distance.fit_judge import fit_judge
+from touchgoal.rewards.end_state import end_costs, put_down
+from touchgoal.rewards.features.embedder import EpisodeEmbedder
+from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
+from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
+from touchgoal.rewards.sources.open_source import open_source
+
+
+def test_no_success_fits_what_measures_it() -> None:
+    """An odd success costs much, though it is among the successes; a lone object is left out."""
+    usual = [embedded(seed) for seed in range(11)]
+    odd, lone = embedded(11, slip=5e-3), replace(embedded(12), object="pear")
+    judge = fit_judge([*usual, odd, lone], [embedded(13, slip=5e-3)], None)
+    assert len(judge.successes) == 12 and len(judge.failures) == 1
+    assert max(judge.successes) > 1.5 * np.sort(judge.successes)[-2]
+
+
+def carried() -> Episode:
+    """The hand rises 10 cm with what it holds and lowers it; at frame 33 of 40 it meets the table."""
+    episode, rows = recorded(40, contact=8), np.arange(40)
+    frames = {key: values.copy() for key, values in episode.frames.items()}
+    frames[FRONT][:, 12:20] = (rows % 8 * 20)[:, None, None, None]
+    pose = np.zeros((40, 7), np.float32)
+    pose[:, 2] = np.interp(rows, (10, 20, 35), (0.0, 0.1, 0.0))
+    wrench = np.zeros((40, 6), np.float32)
+    wrench[33:, 2] = 3
+    frames[TACTILE_LEFT][33:, 80:160] //= 2
+    return replace(episode, frames={**frames, TCP_POSE: pose, WRENCH: wrench})
+
+
+def test_an_end_is_judged_alike_from_less(embedder: EpisodeEmbedder, tmp_path: Path) -> None:  # noqa: F811
+    EpisodeWriter(tmp_path / "set").append(carried())
+    trajectory = open_source(tmp_path / "set", "front").trajectories[0]
+    assert isinstance(trajectory, EpisodeTrajectory)
+    less, again = embed_end(embedder, trajectory), embed_end(embedder, trajectory)
+    whole = embed_trajectory(embedder, trajectory)
+    assert put_down(whole.features, 20) == put_down(less.features, 20) == 33
+    assert len(less.features["image"]) == 1
+    units = {"front": 1e-3, "object": 1e-5, "held": 0.3}
+    goal = {k: whole.features[k][35:36] for k in ("front", "touch", "held", "wrench")}
+    expected = end_costs(whole.features, 20, goal, units, None)
+    assert expected["object"] > 0.1 and expected["front"] > 0.1
+    for one in (less, again):
+        assert end_costs(one.features, 20, goal, units, None) == pytest.approx(expected, abs=1e-3)
+
+
+def test_fitted_judged_and_corrected(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Images alone; a person's word stays when the set is judged again."""
+    pytest.importorskip("transformers")
+    episode, fit = recorded(), ("fit-normalizer", "set", "--judge", "--out")
+    for k in range(10):
+        front = episode.frames[FRONT] + np.uint8(k)
+        if k < 9:  # done: half of the image has changed
+            front[6:, :, 16:] = (250, 200 - k, 30)
+        meta = {"success": k != 9, "object": "cup"}
+        EpisodeWriter(here / "set").append(
+            Episode({FRONT: front, WRIST: front[:, ::-1].copy()}, "pick", meta)
+        )
+        if k == 7:
+            with pytest.raises(SystemExit, match="at least 9 successes.*; there are 8"):
+                main([*fit, "few"])
+    main([*fit, "fit"])
+    assert "of 9 successes and 1 failures" in capsys.readouterr().out
+    judge = ["judge", "set", "--judge", "fit", "--out"]
+    main([*judge, "out"])
+    assert "verdicts agree with the recorded outcome" in capsys.readouterr().out
+    told = json.loads(Path("set/judged.json").read_text())
+    assert told["9"]["verdict"] == "failure" and told["9"]["reasons"]
+    assert Path("out/judged.html").read_text().count("<img") == 20
+    with pytest.raises(SystemExit, match="run it in a terminal"):
+        main([*judge, "x", "--correct"])
+    answers = iter(["f", "", "q"])
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda _: next(answers))
+    main([*judge, "corrected", "--correct"])
+    assert len(json.loads(Path("fit/judge.json").read_text())["failures"]) == 2
+    main([*judge, "again"])
+    told = json.loads(Path("set/judged.json").read_text())
+    assert [one["verdict"] for one in told.values() if one["by"] == "person"] == ["failure"]
