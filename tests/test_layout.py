@@ -22,7 +22,7 @@ REPOSITORY_LINES = 61_080  # of Python, outside tests/
 TEST_LINES = 18_720  # of Python
 PAGE_WORDS = 12_000  # README, CHANGELOG and docs/*.md
 COMMANDS_IN_ALL = 32  # sub-commands included
-OPTIONS_IN_ALL = 389  # of all commands, each with its own
+OPTIONS_IN_ALL = 390  # of all commands, each with its own
 
 ROOT = Path(__file__).parents[1]
 _PAGE = (ROOT / "CONTRIBUTING.md").read_text()
