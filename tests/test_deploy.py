@@ -140,7 +140,7 @@ def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:
 
 class Still(Actor):
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        return np.array([*np.zeros(7), 0.08])
+        return np.array([*np.zeros(7), 0.04])
 
 
 @pytest.mark.parametrize(
