@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -26,18 +26,6 @@ from touchgoal.sim_envs.tasks import make_env
 REFUSED = "refused"  # failure of an episode in which the policy would not act
 _TOLERANCE = 1e-3  # rad or m by which an action may exceed a limit before it counts as clamped
 _LIGHT_TICKS = 10  # from one look at the fingertips' light to the next
-
-
-class Judge(Protocol):
-    """Judges an episode by what is observed, beside the simulator."""
-
-    def ended(self, tick: dict[str, np.ndarray]) -> bool:
-        """Take the next tick; return whether the episode ends with it, in success."""
-        ...
-
-    def verdict(self) -> str:
-        """Return success, failure or unsure, of the newest tick as the end."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -140,12 +128,12 @@ def run_trials(
     policy: Callable[[Any], Actor],
     specs: Sequence[EpisodeSpec],
     workers: Workers,
-    judge: Callable[[Any], Judge] | None = None,
+    judge: Callable[[Any], Any] | None = None,
 ) -> Iterator[Trial]:
     """Run a policy in each episode; yield the trials in order as they end.
 
-    With one worker all runs in this process; for several `policy` and `judge`, which make one for an
-    environment, must pickle.
+    With one worker all runs in this process; for several `policy` and `judge` (as `RunJudge`), which make
+    one for an environment, must pickle.
     """
     if workers == 1:
         for spec in track(specs, "trials", "episode"):
@@ -159,7 +147,7 @@ def run_trial(
     config: TaskConfig,
     policy: Callable[[Any], Actor],
     spec: EpisodeSpec,
-    judge: Callable[[Any], Judge] | None = None,
+    judge: Callable[[Any], Any] | None = None,
 ) -> Trial:
     """Run one episode; a judge's success ends it, too."""
     env = make_env(config)
