@@ -32,11 +32,11 @@ from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.reward import PreparedReward, Reward
 from touchgoal.runtime.errors import UserError
 
-_FIRST_COST_TIMEOUT = 30.0  # s for the first cost, which warms up the networks
+_FIRST_COST_TIMEOUT = 60.0  # s for the first cost, which warms up the networks
 _IDLE_SLEEP = 0.005  # s between looks for a new tick
 _JUDGE_INTERVAL = 1.0  # s from one judgement of a run to the next
 _REST_SECONDS, _REST_SPEED = 0.5, 0.02  # s, rad/s: the joints rest if none was faster for so long
-_MOST_WAITING = 100  # ticks to be measured; older ones are left out
+_MOST_WAITING = 20  # ticks to be measured; older ones are left out where time does not wait
 
 
 class CostMeter:
@@ -161,9 +161,15 @@ def _joint_speed(tick: ft.Observation) -> float:
 class OnlineCost:
     """Measures the newest tick in a thread, whenever the one before is done."""
 
-    def __init__(self, meter: CostMeter, give_up: float = 0.0) -> None:
-        """Start the thread; `close` ends it. `give_up`: rise of the cost that is a failure; 0: none."""
-        self._meter, self._rise = meter, give_up or float("inf")
+    def __init__(self, meter: CostMeter, give_up: float = 0.0, time_waits: bool = False) -> None:
+        """Start the thread; `close` ends it.
+
+        Args:
+            meter: measures the run.
+            give_up: rise of the cost that is a failure; 0: none.
+            time_waits: wait for the meter rather than leave out ticks that a judge needs.
+        """
+        self._meter, self._rise, self._waits = meter, give_up or float("inf"), time_waits
         self.failed = False  # whether the cost has risen by `give_up` for 20 measurements
         self._first: tuple[ft.Observation, ...] = ()  # the run's first ticks, without contact
         self._ticks: deque[tuple[float, ft.Observation]] = deque(maxlen=_MOST_WAITING)
@@ -180,6 +186,9 @@ class OnlineCost:
         """See Cost."""
         if not self._first:
             self._ticks.clear()  # of what `begin` was given
+        while self._waits and self._meter.judges and len(self._ticks) == _MOST_WAITING:
+            self._latest.read()  # DriverError if the thread has ended
+            time.sleep(_IDLE_SLEEP)
         self._ticks.append((time.monotonic(), observation))
         if len(self._first) < START_FRAMES:
             self._first = (*self._first, observation)
@@ -278,7 +287,7 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
         )
     item = task.objects[0] if len(task.objects) == 1 else ""
     meter = CostMeter(reward.prepare(inputs), item, judges=bool(task.judge))
-    return OnlineCost(meter, task.give_up)
+    return OnlineCost(meter, task.give_up, cell.time_waits)
 
 
 def judged_reward(folder: Path, encoder: str | None = None) -> Reward:
