@@ -14,6 +14,7 @@ from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 from unittest.mock import MagicMock
 
 import blocked_packages
@@ -172,7 +173,7 @@ def test_without_a_simulator_the_operator_says_whether_it_is_done(
 class FakeJudge:
     """Says one verdict; after `ends_at` ticks that the run is to end."""
 
-    def __init__(self, verdict: str, ends_at: int = 999) -> None:
+    def __init__(self, verdict: Any, ends_at: int = 999) -> None:
         self.reading, self.ends_at, self.ticks = (
             CostReading(0.3, 0.0, verdict, ("why",)),
             ends_at,
