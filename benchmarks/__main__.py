@@ -54,6 +54,10 @@ BENCHMARKS = {
     ),
     "tactile-realism": ("real_touch.tactile_realism", "simulated against real presses of a ball"),
     "deploy": ("deployment.deploy", "success through the environment, in process and on the wire"),
+    "deploy-judged": (
+        "deployment.judged",
+        "verdicts of a judge on deployments without a simulator's",
+    ),
     "faults": ("deployment.faults", "what a deployment does under every fault"),
     "policy-delay": ("deployment.policy_delay", "success under delays, or by cause of failure"),
     "own-task": ("deployment.own_task", "a task known by demonstrations alone: success by sight"),

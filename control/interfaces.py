@@ -82,6 +82,7 @@ class CostReading:
     stamp: float
     verdict: Literal["", "success", "failure", "unsure"] = ""  # of a judge; "": none, or not asked
     reasons: tuple[str, ...] = ()  # of the verdict, for people
+    done: bool = False  # whether the judge says so lastingly, while the arm rests: it ends the run
 
 
 @runtime_checkable
@@ -199,6 +200,10 @@ class Cost(Protocol):
 
     def read(self) -> CostReading:
         """Return the newest cost; wait for the first, DriverError with the reason if none comes."""
+        ...
+
+    def judge(self) -> CostReading:
+        """Measure the newest tick as the run's end; the verdict is "" without a judge."""
         ...
 
 

@@ -71,7 +71,7 @@ def main(config: Config) -> None:
     cell = read_cell_file(file, config.policy, config.sim, config.seed, config.task, config.target)
     policy, camera_size = load_policy(cell)
     cost = None
-    if cell.task.rewards:
+    if cell.task.rewards or cell.task.judge:
         from touchgoal.rewards.online import load_cell_cost
 
         cost = load_cell_cost(cell)
@@ -177,6 +177,7 @@ def _deploy(
         on_tick=on_tick,
         cost=cost,
         camera_size=camera_size,
+        ask=terminal.ask,
     )
     with terminal.watching():
         print(f"{'MOVING' if config.execute else 'dry run'}: {HELP}", flush=True)

@@ -1,8 +1,11 @@
-"""The cost of a run while it happens, as `reward-curves` computes it from the recording."""
+"""The cost of a run while it happens, as `reward-curves` computes it from the recording; its judgement."""
 
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import torch
@@ -13,16 +16,27 @@ from touchgoal.control.interfaces import CostReading
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.rewards.curves import FUSED
 from touchgoal.rewards.distance.cost import compute_curves
-from touchgoal.rewards.distance.normalizer import REAL_SCENE
-from touchgoal.rewards.features.embedded import EmbeddedGoal
+from touchgoal.rewards.distance.normalizer import NORMALIZER, REAL_SCENE
+from touchgoal.rewards.features.embedded import (
+    EmbeddedEpisode,
+    EmbeddedGoal,
+    Features,
+    join_rows,
+    split_features,
+)
 from touchgoal.rewards.features.embedder import FeatureStream
-from touchgoal.rewards.goals import Inputs, parse_goal, same_episode
+from touchgoal.rewards.features.successful_ends import GOAL_FILE
+from touchgoal.rewards.goals import GoalFile, Inputs, parse_goal, same_episode
+from touchgoal.rewards.judge import FIT_JUDGE, JUDGE, Judgement
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.reward import PreparedReward, Reward
 from touchgoal.runtime.errors import UserError
 
-_FIRST_COST_TIMEOUT = 30.0  # s for the first cost, which warms up the networks
+_FIRST_COST_TIMEOUT = 60.0  # s for the first cost, which warms up the networks
 _IDLE_SLEEP = 0.005  # s between looks for a new tick
+_JUDGE_INTERVAL = 1.0  # s from one judgement of a run to the next
+_REST_SECONDS, _REST_SPEED = 0.5, 0.02  # s, rad/s: the joints rest if none was faster for so long
+_MOST_WAITING = 20  # ticks to be measured; older ones are left out where time does not wait
 
 
 class CostMeter:
@@ -30,18 +44,28 @@ class CostMeter:
 
     They are equal from the fifth tick on. Before, the fingertips' background is the median of the
     ticks so far, while a recording's is always that of its first five.
+
+    Attributes:
+        judges: whether the run is judged, once a second.
+        judgement: the newest; None before the first.
     """
 
     def __init__(
-        self, reward: PreparedReward, object_name: str = "", rate: float = ft.CONTROL_HZ
+        self,
+        reward: PreparedReward,
+        object_name: str = "",
+        rate: float = ft.CONTROL_HZ,
+        judges: bool = False,
     ) -> None:
         """Prepare for one run.
 
-        UserError if its goal is known only at its end, or if several modalities have no normalizer.
+        UserError if its goal is known only at its end, if several modalities have no normalizer, or
+        if it is to be judged without a judge.
 
         Args:
             object_name: object of the run, which chooses among the goals; "" if unknown.
             rate: ticks per second.
+            judges: judge the run by the judge beside the normalizer.
         """
         if same_episode(reward.goals):
             raise UserError("goals last and frame:K are not known before the end of a run")
@@ -50,66 +74,124 @@ class CostMeter:
                 "raw distances of several modalities cannot be averaged: give one "
                 "goal of one modality (image:PATH or text:SENTENCE), or a normalizer"
             )
-        self._reward, self._object, self._rate = reward, object_name, rate
+        self._reward, self._object, self._rate, self.judges = reward, object_name, rate, judges
+        if judges:
+            _ = reward.judge  # an error is told before the run
         self._goal: EmbeddedGoal | None = None
         self._stream: FeatureStream | None = None
-        self._first: Sequence[ft.Observation] = ()  # that the stream's background is the median of
-        self._parts: dict[str, float] = {}  # cost of each part at the tick before
+        self._begin(())
 
-    def measure(self, observation: ft.Observation, first: Sequence[ft.Observation]) -> float:
+    def _begin(self, first: Sequence[ft.Observation]) -> None:
+        self._first = first  # that the stream's background is the median of
+        self._parts: dict[str, float] = {}  # cost of each part at the tick before
+        self._felt: list[Features] = []  # of touch and arm, of all ticks so far
+        self._seen: EmbeddedEpisode | None = None  # the newest ticks, images included
+        self._moved = self._unjudged = 0  # ticks since a joint moved, and since the last judgement
+        self.judgement: Judgement | None = None
+        self._successes = 0  # judgements in a row
+
+    @property
+    def done(self) -> bool:
+        """Whether the last two judgements, a second apart, said success while the arm rested."""
+        return self._successes > 1
+
+    def measure(
+        self,
+        observation: ft.Observation,
+        first: Sequence[ft.Observation],
+        missed: Sequence[ft.Observation] = (),
+    ) -> float:
         """Return the cost of a tick: fused, or the mean over the modalities without parts.
 
         `first` are the run's first ticks in order, at most five. While more of them come in, the
-        background changes, and they are measured anew.
+        background changes, and they are measured anew. `missed` are the ticks since the last measured
+        one; a judge needs them, but not their images.
         """
-        ticks, known = [observation], self._first
-        if self._stream is None or len(first) != len(known) or first[0] is not known[0]:
-            before = [tick for tick in first if tick is not observation]
-            ticks = [*before, observation]
-            embedder = self._reward.embedder
-            self._stream = embedder.stream(_stacked(first), self._rate, "this run")
-            self._first, self._parts = first, {}
-        trajectory = replace(self._stream.embed(_stacked(ticks)), object=self._object)
-        reward = self._reward
+        ticks, seen = [*missed, observation], 1
+        if self._stream is None or len(first) != len(self._first) or first[0] is not self._first[0]:
+            ticks = list({id(tick): tick for tick in (*first, *ticks)}.values())
+            self._stream = self._reward.embedder.stream(_stacked(first), self._rate, "this run")
+            seen = seen if missed else len(ticks)
+            self._begin(first)
+        embedded = replace(self._stream.embed(_stacked(ticks, seen)), object=self._object)
+        trajectory, reward = embedded.take(slice(-seen, None)), self._reward
         if self._goal is None:
             self._goal = reward.embedder.embed_goal(reward.goals, trajectory)
         curves = compute_curves(
             trajectory, self._goal, reward.normalizer, reward.value, self._parts, reward.plain
         )
         self._parts = {name: float(cost[-1]) for name, cost in curves.parts.items()}
+        if self.judges:
+            self._seen = trajectory
+            self._felt.append(split_features(embedded.features)[1])
+            for tick in ticks:
+                self._moved = 0 if _joint_speed(tick) > _REST_SPEED else self._moved + 1
+            self._unjudged += len(ticks)
+            if self._unjudged >= _JUDGE_INTERVAL * self._rate:
+                self.judge()
         if FUSED in curves.parts:
             return self._parts[FUSED]
         return float(np.mean([curves.costs[name][-1] for name in curves.raw]))
 
+    def judge(self) -> Judgement:
+        """Judge the newest tick as the end of the run; at least one was measured."""
+        assert self._seen is not None
+        self._felt, self._unjudged = [join_rows(self._felt)], 0
+        seen = split_features(self._seen.features)[0]
+        told = self._reward.judge_episode(replace(self._seen, features={**seen, **self._felt[0]}))
+        rests = self._moved >= _REST_SECONDS * self._rate
+        self._successes = self._successes + 1 if told.verdict == "success" and rests else 0
+        self.judgement = told
+        return told
 
-def _stacked(ticks: Sequence[ft.Observation]) -> dict[str, np.ndarray]:
-    """Return what the cost reads of some ticks, by key."""
+
+def _stacked(ticks: Sequence[ft.Observation], seen: int | None = None) -> dict[str, np.ndarray]:
+    """Return what the cost reads of some ticks, by key; images of the last `seen` alone."""
     keys = [key for key in (*ft.CAMERAS, *ft.TACTILE, ft.WRENCH, ft.TCP_POSE) if key in ticks[0]]
-    return {key: np.stack([tick[key] for tick in ticks]) for key in keys}
+    last = ticks[-(seen or len(ticks)) :]
+    return {k: np.stack([t[k] for t in (last if k in ft.CAMERAS else ticks)]) for k in keys}
+
+
+def _joint_speed(tick: ft.Observation) -> float:
+    """Speed of the fastest joint, rad/s; infinite if it is unknown."""
+    state = tick.get(ft.STATE)
+    return np.inf if state is None else float(np.abs(state[len(state) // 2 : -1]).max())
 
 
 class OnlineCost:
     """Measures the newest tick in a thread, whenever the one before is done."""
 
-    def __init__(self, meter: CostMeter, give_up: float = 0.0) -> None:
-        """Start the thread; `close` ends it. `give_up`: rise of the cost that is a failure; 0: none."""
-        self._meter, self._rise = meter, give_up or float("inf")
+    def __init__(self, meter: CostMeter, give_up: float = 0.0, time_waits: bool = False) -> None:
+        """Start the thread; `close` ends it.
+
+        Args:
+            meter: measures the run.
+            give_up: rise of the cost that is a failure; 0: none.
+            time_waits: wait for the meter rather than leave out ticks that a judge needs.
+        """
+        self._meter, self._rise, self._waits = meter, give_up or float("inf"), time_waits
         self.failed = False  # whether the cost has risen by `give_up` for 20 measurements
         self._first: tuple[ft.Observation, ...] = ()  # the run's first ticks, without contact
-        self._newest: tuple[float, ft.Observation, tuple[ft.Observation, ...]] | None = None
+        self._ticks: deque[tuple[float, ft.Observation]] = deque(maxlen=_MOST_WAITING)
+        self._measuring = Lock()
         self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)
 
     def begin(self, observation: ft.Observation) -> None:
         """See Cost; the first measurement warms up the networks."""
         self.failed, self._first = False, ()
         self._watch, self._watched = FailureWatch(self._rise, ft.CONTROL_HZ), time.monotonic()
-        self._newest = time.monotonic(), observation, (observation,)
+        self._ticks.append((time.monotonic(), observation))
 
     def hand_over(self, observation: ft.Observation) -> None:
         """See Cost."""
+        if not self._first:
+            self._ticks.clear()  # of what `begin` was given
+        while self._waits and self._meter.judges and len(self._ticks) == _MOST_WAITING:
+            self._latest.read()  # DriverError if the thread has ended
+            time.sleep(_IDLE_SLEEP)
+        self._ticks.append((time.monotonic(), observation))
         if len(self._first) < START_FRAMES:
             self._first = (*self._first, observation)
-        self._newest = time.monotonic(), observation, self._first
 
     def read(self) -> CostReading:
         """See Cost; the cost is the mean over the modalities that have a goal.
@@ -122,18 +204,41 @@ class OnlineCost:
             self.failed |= self._watch.update(reading.cost)
         return reading
 
+    def judge(self) -> CostReading:
+        """See Cost."""
+        reading = self._latest.read()  # DriverError if no cost can be measured
+        with self._measuring:
+            reading = self._measure() or reading
+            if not self._meter.judges:
+                return reading
+            told = self._meter.judge()
+        return replace(reading, verdict=told.verdict, reasons=told.reasons)
+
     def close(self) -> None:
         """End the thread."""
         self._latest.close()
 
     def _measure_newest(self) -> CostReading | None:
-        newest, self._newest = self._newest, None
-        if newest is None:
+        with self._measuring:
+            reading = self._measure()
+        if reading is None:
             time.sleep(_IDLE_SLEEP)
+        return reading
+
+    def _measure(self) -> CostReading | None:
+        """Measure the newest tick; None if it was measured before."""
+        first, ticks, meter = self._first, [], self._meter
+        while self._ticks:
+            ticks.append(self._ticks.popleft())
+        if not ticks:
             return None
         torch.set_num_threads(1)  # of this thread: the control loop needs the other core
-        stamp, observation, first = newest
-        return CostReading(self._meter.measure(observation, first), stamp)
+        stamp, newest = ticks[-1]
+        missed = [tick for _, tick in ticks[:-1]] if meter.judges else ()
+        cost, told = meter.measure(newest, first or (newest,), missed), meter.judgement
+        if told is None:
+            return CostReading(cost, stamp)
+        return CostReading(cost, stamp, told.verdict, told.reasons, meter.done)
 
 
 class FailureWatch:
@@ -171,11 +276,25 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
         cameras=cameras,
         task=cell.task.instruction or cell.task.name,
     )
-    task = cell.task
-    reward = Reward(
-        [parse_goal(text) for text in task.rewards],
-        encoder=task.encoder or None,
-        normalizer=task.normalizer or None,
-    )
-    meter = CostMeter(reward.prepare(inputs), task.objects[0] if len(task.objects) == 1 else "")
-    return OnlineCost(meter, task.give_up)
+    task, folder = cell.task, Path(cell.task.judge)
+    if task.judge:
+        reward = judged_reward(folder, task.encoder or None)
+    else:
+        reward = Reward(
+            [parse_goal(text) for text in task.rewards],
+            encoder=task.encoder or None,
+            normalizer=task.normalizer or None,
+        )
+    item = task.objects[0] if len(task.objects) == 1 else ""
+    meter = CostMeter(reward.prepare(inputs), item, judges=bool(task.judge))
+    return OnlineCost(meter, task.give_up, cell.time_waits)
+
+
+def judged_reward(folder: Path, encoder: str | None = None) -> Reward:
+    """Return the reward whose goals, normalizer, value and judge lie in a folder of `fit-normalizer --judge`.
+
+    UserError: they do not.
+    """
+    if not (folder / JUDGE).is_file():
+        raise UserError(f"there is no {folder / JUDGE}: {FIT_JUDGE}")
+    return Reward(GoalFile(folder / GOAL_FILE), encoder=encoder, normalizer=folder / NORMALIZER)

@@ -1,5 +1,7 @@
-"""The cost to a goal as the reward of a Gymnasium environment."""
+"""The cost to a goal as the reward of a Gymnasium environment, and the judge of its episodes."""
 
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -8,7 +10,7 @@ import numpy as np
 from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE, Observation
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.online import CostMeter
+from touchgoal.rewards.online import CostMeter, judged_reward
 from touchgoal.rewards.reward import Reward
 
 
@@ -72,3 +74,41 @@ class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray
         if len(self._first) < START_FRAMES:
             self._first.append(observation)
         return self._meter.measure(observation, self._first)
+
+
+class RunJudge:
+    """Judge of one episode of an environment, as `deploy` asks it: once a second, and at the end."""
+
+    def __init__(self, folder: Path, env: gym.Env) -> None:
+        """Take the folder of `fit-normalizer --judge`, and an environment of touchgoal after its reset.
+
+        UserError: no judge lies there, or it cannot judge such observations.
+        """
+        reward = _judged_reward(folder).prepare(inputs_of(env))
+        about, self._rate = env.unwrapped.episode_info(), env.unwrapped.config.control_hz  # pyright: ignore[reportAttributeAccessIssue]
+        self._meter = CostMeter(reward, str(about.get("object", "")), self._rate, judges=True)
+        self._first: tuple[Observation, ...] = ()
+        self._waiting: list[Observation] = []  # to be measured
+
+    def ended(self, tick: Observation) -> bool:
+        """Take the next tick; return whether the judge says lastingly that the task is done."""
+        if len(self._first) < START_FRAMES:
+            self._first = (*self._first, tick)
+        self._waiting.append(tick)
+        if len(self._waiting) >= self._rate:
+            self._measure()
+        return self._meter.done
+
+    def verdict(self) -> str:
+        """Return the verdict on the newest tick as the episode's end."""
+        if self._waiting:
+            self._measure()
+        return self._meter.judge().verdict
+
+    def _measure(self) -> None:
+        *missed, newest = self._waiting
+        self._meter.measure(newest, self._first, missed)
+        self._waiting = []
+
+
+_judged_reward = cache(judged_reward)  # encoders are loaded once a process

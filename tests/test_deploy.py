@@ -14,6 +14,7 @@ from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 from unittest.mock import MagicMock
 
 import blocked_packages
@@ -27,9 +28,9 @@ from running_twin import RunningTwin
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
-from touchgoal.control.deployment.control_loop import Request, TickStatus
-from touchgoal.control.deployment.session import Session
-from touchgoal.control.interfaces import Actor, DriverError
+from touchgoal.control.deployment.control_loop import JUDGED, Request, TickStatus
+from touchgoal.control.deployment.session import Session, metrics, report
+from touchgoal.control.interfaces import Actor, CostReading, DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.episodes.episode_recorder import EpisodeRecorder
@@ -140,7 +141,7 @@ def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:
 
 class Still(Actor):
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        return np.array([*np.zeros(7), 0.08])
+        return np.array([*np.zeros(7), 0.04])
 
 
 @pytest.mark.parametrize(
@@ -167,6 +168,60 @@ def test_without_a_simulator_the_operator_says_whether_it_is_done(
     assert session.run().success is success
     meta = EpisodeSet(tmp_path / "episodes").meta(0)
     assert meta["outcome"] == outcome and meta.get("success") is success
+
+
+class FakeJudge:
+    """Says one verdict; after `ends_at` ticks that the run is to end."""
+
+    def __init__(self, verdict: Any, ends_at: int = 999) -> None:
+        self.reading, self.ends_at, self.ticks = (
+            CostReading(0.3, 0.0, verdict, ("why",)),
+            ends_at,
+            0,
+        )
+
+    def begin(self, observation: dict) -> None: ...
+
+    def hand_over(self, observation: dict) -> None:
+        self.ticks += 1
+
+    def read(self) -> CostReading:
+        return replace(self.reading, done=self.ticks >= self.ends_at)
+
+    def judge(self) -> CostReading:
+        return self.reading
+
+
+@pytest.mark.parametrize(
+    ("judge", "answer", "success", "outcome", "reason"),
+    [
+        (FakeJudge("success", 5), None, True, "judged success", JUDGED),
+        (FakeJudge("success"), None, True, "judged success", "time is up (1 s)"),
+        (FakeJudge("failure"), True, False, "judged failure", "time is up (1 s)"),
+        (FakeJudge("unsure"), None, None, "unknown", "time is up (1 s)"),
+        (FakeJudge("unsure"), True, True, "success", "time is up (1 s)"),
+    ],
+)
+def test_a_judge_ends_a_run_and_says_how_it_ended(
+    judge: FakeJudge, answer: bool | None, success: bool | None, outcome: str, reason: str, tmp_path: Path
+) -> None:  # fmt: skip
+    """Of a simulator's verdict nothing is read; a person is asked where the judge is unsure."""
+    text = SIM.replace("seed = 3", 'seed = 3, seconds = 1.0, judge = "runs/judge"')
+    cell = read_cell_file(write_cell_file(tmp_path, text.replace('"expert"', '"shipped"')))
+    connection = replace(FakeCell().connection(), truth=lambda: {}["success"])
+    safety = ActionFilter(connection.robot, ft.CONTROL_HZ)
+    recorder = EpisodeRecorder(tmp_path / "episodes", ft.CONTROL_HZ)
+    result = Session(
+        cell, connection, safety, recorder, True, lambda _: Still(), lambda: "", lambda _: None, judge,
+        ask=lambda question: answer,
+    ).run()  # fmt: skip
+    meta = EpisodeSet(tmp_path / "episodes").meta(0)
+    assert (result.success, result.ending.reason) == (success, reason)
+    assert (meta["outcome"], meta["judged"]) == (outcome, judge.reading.verdict)
+    assert meta.get("success") == (answer if outcome == "success" else None)  # a person's alone
+    ticks = 5 if reason == JUDGED else 20 + 20 + 2  # it held still for a second
+    assert result.log.ticks == pytest.approx(ticks, abs=2)
+    assert f"the judge says: {judge.reading.verdict}" in report(result, metrics(result), "")
 
 
 OWN = """

@@ -17,6 +17,7 @@ from toy_towers import PaintTowers
 from touchgoal.control.cell.cell_file import EXAMPLES, read_cell_file
 from touchgoal.control.features import (
     FRONT,
+    STATE,
     TACTILE,
     TACTILE_LEFT,
     TACTILE_RIGHT,
@@ -34,11 +35,14 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
+from touchgoal.rewards.end_state import end_cost
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
-from touchgoal.rewards.goals import GoalImage, Inputs, Sentence, assign_goals
+from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
+from touchgoal.rewards.goals import GoalImage, Inputs, Sentence, assign_goals, parse_goal
+from touchgoal.rewards.judge import JUDGE, Judge
 from touchgoal.rewards.online import CostMeter, OnlineCost, load_cell_cost
 from touchgoal.rewards.report.plot import plot
-from touchgoal.rewards.reward import Reward
+from touchgoal.rewards.reward import PreparedReward, Reward
 from touchgoal.runtime.errors import UserError
 
 EPISODE = recorded()
@@ -259,10 +263,12 @@ def test_cost_during_a_run_is_raw_without_normalizer(encoder: TouchEncoder) -> N
 class Rising(CostMeter):
     """A meter of a cost that rises at the second measurement, after which it hangs until it may go on."""
 
+    judges, judgement = False, None
+
     def __init__(self) -> None:
         self.costs, self.may_go_on = [0.1, 0.9], threading.Event()
 
-    def measure(self, observation: dict, first: object) -> float:
+    def measure(self, observation: dict, first: object, missed: object = ()) -> float:
         return self.costs.pop(0) if self.costs else self.may_go_on.wait() * 0.9
 
 
@@ -312,6 +318,42 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder) -> No
     during = [meter.measure(tick, ticks[: min(i + 1, 5)]) for i, tick in enumerate(ticks)]
     np.testing.assert_allclose(during[4:], expected[4:], atol=1e-6)
     assert np.abs(during[0] - expected[0]) > 1e-4  # one frame is another background
+
+
+def test_a_run_is_judged_as_its_recording_and_ends_when_it_rests(
+    encoder: TouchEncoder, tmp_path: Path
+) -> None:
+    """Once a second, here of four ticks, of which some come in late; of these only touch is embedded."""
+    still, frames = np.zeros((24, 15), np.float32), recorded(24).frames
+    still[:18, 9] = 0.03  # rad/s
+    frames = {FRONT: frames[FRONT], **{k: frames[k] for k in TACTILE}, STATE: still}
+    embedder = EpisodeEmbedder(PaintTowers(), encoder)
+    recording = embedder.embed_episode(Episode(frames=frames, task="", meta={}), 4.0, "recording")
+    ends = SuccessfulEnds.of([recording.take(slice(0, n)) for n in (10, 12)])
+    ends.save(tmp_path / GOAL_FILE)
+    units = {"object": 0.01, "held": 0.3, "slip": 1e-3}
+    ends = {"image": 1.0, "tactile": 1.0}, {"image": 0.1, "tactile": 0.1}
+    normalizer = DistanceNormalizer(*ends, units, {}, embedder.made_with, "recorded", 3)
+    goals = assign_goals([parse_goal(f"goal:{tmp_path / GOAL_FILE}")], ("image", "tactile"))
+    reward = PreparedReward(embedder, goals, normalizer, None, "", folder=tmp_path)
+    with pytest.raises(UserError, match="no judge lies beside"):
+        CostMeter(reward, judges=True)
+    costs = [end_cost(reward.end_costs(recording.take(slice(0, n)))) for n in (4, 24)]
+    assert costs[0] > costs[1] + 0.1
+    Judge((costs[1] + 0.01,) * 20, (costs[0],) * 20).save(tmp_path / JUDGE)
+    meter, told, done = CostMeter(reward, rate=4.0, judges=True), [], []
+    ticks = [{key: values[i] for key, values in frames.items()} for i in range(24)]
+    for i in (0, 1, 2, 3, 4, 7, 8, 11, 15, 19, 23):
+        missed = ticks[{7: 5, 11: 9, 15: 12, 19: 16, 23: 20}.get(i, i) : i]
+        meter.measure(ticks[i], ticks[: min(i + 1, 5)], missed)
+        if meter.judgement is not (told[-1] if told else None):
+            told.append(meter.judgement)
+            expected = reward.judge_episode(recording.take(slice(0, i + 1)))
+            assert told[-1].verdict == expected.verdict
+            assert told[-1].parts == pytest.approx(expected.parts, abs=1e-5)
+        done.append(meter.done)
+    assert [t.verdict for t in told] == ["failure"] * 2 + ["success"] * 4
+    assert done == [False] * 10 + [True]  # it moved until tick 17, and was judged at 15, 19 and 23
 
 
 def test_a_cell_chooses_the_encoder_of_its_rewards(tmp_path: Path) -> None:

@@ -119,7 +119,9 @@ def _check_own_task(task: TaskSection) -> None:
 
 def _check_task(cell: CellConfig) -> None:
     task = cell.task
-    if not task.rewards and (task.normalizer or task.encoder):
+    if task.judge and (task.rewards or task.normalizer):
+        raise UserError("task.judge has its own goals: leave out task.rewards and task.normalizer")
+    if not (task.rewards or task.judge) and (task.normalizer or task.encoder):
         what = "normalizer" if task.normalizer else "encoder"
         raise UserError(f"task.{what} does nothing without task.rewards: name a goal there")
     if task.start is not None and len(task.start) != _JOINTS[cell.arm]:

@@ -85,7 +85,8 @@ class Ending:
 Request = Literal["", "stop", "done", "not done", "discard", "success", "failed"]
 """Operator's request: go on, stop the arm, end with the task done or not, or without a record;
 success: a simulator's; failed: the cost's."""
-PLAN_ENDED = "the plan is through"
+PLAN_ENDED, TIME_UP = "the plan is through", "time is up"
+JUDGED = "the judge says that the task is done"
 STOPPED_BY_OPERATOR, DISCARDED = "stopped by the operator", "discarded by the operator"
 _REQUESTED_ENDINGS: dict[Request, Ending] = {
     "done": Ending("the operator says that the task is done", done=True),
@@ -153,12 +154,15 @@ class ControlLoop:
         """Joint positions (rad) commanded now."""
         return self.state.q
 
-    def run(self, actor: interfaces.Actor, seconds: float, log: RunLog) -> Ending:
-        """Run the actor until it is done, time is up, a person ends it or a fault stops it."""
+    def run(self, actor: interfaces.Actor, seconds: float, log: RunLog, new: bool = True) -> Ending:
+        """Run the actor until it is done, time is up, a person or judge ends it or a fault stops it.
+
+        Without `new` it goes on with the run before.
+        """
         try:
             real = isinstance(self._connection.clock, RealClock)
             with _realtime_priority() if real else nullcontext():
-                return self._loop(actor, seconds, log)
+                return self._loop(actor, seconds, log, new)
         except UserError as error:
             return self._arm_first(self.stop(str(error), "check what it names, then start again"))
         except (Exception, SystemExit) as error:  # most likely the policy's; stop in any case
@@ -170,10 +174,10 @@ class ControlLoop:
         finally:
             _done(actor.close)
 
-    def _loop(self, actor: interfaces.Actor, seconds: float, log: RunLog) -> Ending:
+    def _loop(self, actor: interfaces.Actor, seconds: float, log: RunLog, new: bool) -> Ending:
         clock = self._connection.clock
         observation = read_only(self._read().observation)
-        if self._cost:
+        if self._cost and new:
             self._cost.begin(observation)
         actor.start(observation)
         if self._cost:
@@ -186,7 +190,7 @@ class ControlLoop:
             if ending is None and actor.done:
                 ending = Ending(PLAN_ENDED)
             if ending is None and clock.now() - begin > seconds:
-                ending = Ending(f"time is up ({seconds:.0f} s)", done=False)
+                ending = Ending(f"{TIME_UP} ({seconds:.0f} s)", done=False)
             if ending is not None:
                 return ending
             if not first:
@@ -269,7 +273,7 @@ class ControlLoop:
         if cost is not None:
             tick[ft.COST] = np.array([cost.cost], np.float32)
         log.add(tick)
-        return None
+        return Ending(JUDGED, done=True) if cost is not None and cost.done else None
 
     def _device_fault(self, reading: CellReading) -> Ending | None:
         """Stop for a device that reports a fault, for a lost object or a hand that does not follow."""

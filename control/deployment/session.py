@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,7 +13,9 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import (
     DISCARDED,
+    JUDGED,
     PLAN_ENDED,
+    TIME_UP,
     ControlLoop,
     Ending,
     Request,
@@ -21,7 +23,7 @@ from touchgoal.control.deployment.control_loop import (
 )
 from touchgoal.control.deployment.scripted import start_move
 from touchgoal.control.features import Observation
-from touchgoal.control.interfaces import Actor, Cost
+from touchgoal.control.interfaces import Actor, Cost, CostReading
 from touchgoal.control.run_log import SLOW_ARM, RunLog, slow_arm
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.sensors.exchanged import Image, cameras_exchanged
@@ -34,6 +36,8 @@ _CLOSE_TO_START = 0.1  # rad; nearer than that no start move is made
 _START_TIMEOUT = 60.0  # s for the start move
 _SETTLE_TIME = 2.0  # s that a simulator may take to see that the task is done
 _ASK_INTERVAL = 0.2  # s between questions to a twin
+_HOLD_TIME = 1.0  # s that the arm holds still before a judge is asked how the run ended
+_BY_JUDGE = {"success": True, "failure": False, "unsure": None}
 _VERDICTS = {True: "done", False: "not done", None: "unknown whether it is done"}
 
 Truth = Callable[[], dict[str, Any]]  # return what a simulator knows of its scene
@@ -60,13 +64,15 @@ class Result:
 
     ending: Ending  # how the run ended
     log: RunLog  # its figures
-    success: bool | None  # whether the task is done, by the simulator or the ending; None: unknown
+    # whether the task is done, by the simulator, the judge, a person or the ending; None: unknown
+    success: bool | None
     # of the task in [0, 1], by the simulator; for a task of one's own the share of the distance to
     # its goal that is gone since the start; None without either
     progress: float | None
     held_width: float | None  # width of the object still in the hand, m; None: no object
     episode: int | None  # index of the recorded episode; None without one
     recording_error: str = ""  # why there is none, if there should be one
+    judged: CostReading | None = None  # verdict of a judge on the run's end, if one was asked
 
 
 @dataclass(frozen=True)
@@ -79,11 +85,13 @@ class Session:
     recorder: Recorder
     execute: bool  # False: a dry run, which records nothing
     make_actor: Callable[[ControlLoop], Actor]  # makes the actor when the arm is at its start
-    # operator_request, on_tick, cost, camera_size: see ControlLoop
+    # operator_request, on_tick, cost, camera_size: see ControlLoop; ask: asks a person whether the task
+    # is done, of whom the judge is told to be unsure; returns None if nobody says so
     operator_request: Callable[[], Request]
     on_tick: Callable[[TickStatus], None]
     cost: Cost | None = None
     camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2]
+    ask: Callable[[str], bool | None] = lambda question: None
 
     def run(self) -> Result:
         """Run start move, task and recording; at the end the arm rests or holds its last command.
@@ -117,23 +125,42 @@ class Session:
         picked = self.execute and scripted and ending.reason == PLAN_ENDED
         if picked and self._held_width() is None:  # it ends with the object in the hand
             ending = Ending(f"{PLAN_ENDED}, but the hand holds nothing", done=False)
+        ending, judged = self._judge(ending, loop, log)
         success = self._success(ending)
         episode, recording_error = None, ""
         if self.execute and log.ticks and ending.reason != DISCARDED:
             try:
-                episode = self._save_episode(ending, success)
+                episode = self._save_episode(ending, success, judged)
             except (OSError, UserError, MemoryError) as error:
                 recording_error = (
                     f"this episode could not be saved ({error}); those before it are whole"
                 )
-        return Result(
-            ending, log, success, self._progress(log), self._held_width(), episode, recording_error
-        )
+        progress, held = self._progress(log), self._held_width()
+        return Result(ending, log, success, progress, held, episode, recording_error, judged)
 
     @property
     def _truth(self) -> Truth | None:
-        """Source of a simulator's ground truth; None for a task of one's own, which has none."""
-        return None if self.cell.task.own else self.connection.truth
+        """Source of a simulator's ground truth; None for a task of one's own, or one that a judge judges."""
+        return None if self.cell.task.own or self.cell.task.judge else self.connection.truth
+
+    def _judge(
+        self, ending: Ending, loop: ControlLoop, log: RunLog
+    ) -> tuple[Ending, CostReading | None]:
+        """Ask the judge, and a person where it is unsure, how a run ended that nobody has ended."""
+        if self.cost is None or not self.execute or not self.cell.task.judge:
+            return ending, None
+        if ending.reason == PLAN_ENDED or ending.reason.startswith(TIME_UP):
+            held = loop.run(_Still(loop), _HOLD_TIME, log, new=False)
+            if held.reason.startswith(TIME_UP):
+                told = self.cost.judge()
+                if (done := _BY_JUDGE[told.verdict]) is None:
+                    why = "; ".join(told.reasons)
+                    done = self.ask(f"the judge is unsure whether the task is done ({why})")
+                return replace(ending, done=done), told
+            ending = held
+        if ending.reason == JUDGED:
+            return ending, replace(self.cost.read(), verdict="success", reasons=())
+        return ending, None
 
     def _move_to_start(self, loop: ControlLoop) -> Ending | None:
         """Move to the start pose; the ending if the run cannot go on from there."""
@@ -199,9 +226,12 @@ class Session:
             return None
         return reading.width if reading.grasped else None
 
-    def _save_episode(self, ending: Ending, success: bool | None) -> int:
-        cell = self.cell
+    def _save_episode(
+        self, ending: Ending, success: bool | None, judged: CostReading | None
+    ) -> int:
+        cell, by_judge = self.cell, judged is not None and judged.verdict != "unsure"
         outcome = {True: "success", False: "failure", None: "unknown"}[success]
+        outcome = f"judged {outcome}" if by_judge else outcome
         meta: dict[str, Any] = {
             "sensor": cell.sensor,
             "arm": cell.arm,
@@ -210,7 +240,9 @@ class Session:
             "outcome": "stopped" if ending.stopped else outcome,
             "ending": ending.reason,
         }
-        if success is not None:
+        if judged is not None:
+            meta["judged"] = judged.verdict
+        if success is not None and not by_judge:  # as a person or a simulator says
             meta["success"] = success
         return self.recorder.save(cell.task.instruction or cell.task.name, meta)
 
@@ -232,6 +264,8 @@ def metrics(result: Result) -> dict[str, Any]:
         "advice": ending.advice,
         "rest_seconds": ending.rest_seconds,
         "success": result.success,
+        "judged": result.judged
+        and {"verdict": result.judged.verdict, "reasons": result.judged.reasons},
         "progress": result.progress,
         "held_width": result.held_width,
         "episode": result.episode,
@@ -270,7 +304,19 @@ def report(result: Result, numbers: dict[str, Any], episodes: str) -> str:
     lines.append(str(ending) if ending.stopped else f"ended: {ending}")
     if not ending.stopped and (result.episode is not None or result.success is not None):
         lines.append(f"task: {_VERDICTS[result.success]}")
+    if (told := result.judged) is not None:
+        lines.append("the judge says: " + ", ".join([told.verdict, *told.reasons]))
     return "\n".join(lines)
+
+
+class _Still(Actor):
+    """Holds arm and gripper where they are commanded to be."""
+
+    def __init__(self, loop: ControlLoop) -> None:
+        self._action = np.append(np.zeros(len(loop.commanded())), loop.width)
+
+    def act(self, observation: Observation) -> np.ndarray:
+        return self._action
 
 
 class _SuccessWatch:

@@ -83,6 +83,7 @@ RECORDING_HELP = (
 _RECORDING_REQUESTS: dict[str, Request] = {**_KEY_REQUESTS, "q": "discard"}
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _TICKS_PER_LINE = 4
+_ASK_INTERVAL = 0.05  # s between looks for an answer
 
 
 def say(text: str) -> None:
@@ -122,6 +123,16 @@ class Terminal:
                     self._request = request
         return self._request
 
+    def ask(self, question: str) -> bool | None:
+        """Return what the operator answers by the keys of done and not done; None without an answer."""
+        if self._keyboard is None:
+            return None
+        say(f"\n{question}: Enter if it is, n if not, q if you do not know")
+        while not (request := self.operator_request()):
+            time.sleep(_ASK_INTERVAL)
+        answers: dict[Request, bool] = {"done": True, "not done": False}
+        return answers.get(request)
+
     def show_tick(self, status: TickStatus) -> None:
         """Update the status line, every few ticks."""
         self._tick_count += 1
@@ -134,7 +145,8 @@ class Terminal:
         cost = ""
         if status.cost is not None:
             old = time.monotonic() - status.cost.stamp
-            cost = f"cost {status.cost.cost:5.2f}" + (f", {old:.0f} s old" if old > 1 else "")
+            cost = f"cost {status.cost.cost:5.2f} {status.cost.verdict}"
+            cost += f", {old:.0f} s old" if old > 1 else ""
         line = (
             f"{status.seconds:6.1f} s  {mode:<24}  {force:5.1f} N  "
             f"gel {1e3 * reading.indentation.max():3.1f} mm  gripper {1e3 * status.width:3.0f} mm  "
