@@ -97,7 +97,7 @@ class LiftAndHold(PickPlace):
         return float(success), success
 
 
-class HandControl(gym.Wrapper[Seen, np.ndarray, Observation, np.ndarray]):
+class HandControl(gym.Wrapper):
     """Four actions in [-1, 1], the hand's velocity and target width; eight numbers observed.
 
     With `gamma`, around a RewardWrapper, steps pay the sparse reward and the potential's gain.
