@@ -42,6 +42,8 @@ BENCHMARKS = {
         "demonstrations weighted, checkpoints ranked by the reward",
     ),
     "grasp-search": ("papers.grasp_search", "grasps found by trial on the cost"),
+    "grip-search": ("papers.grip_search", "grip force found by trial where a crush is not seen"),
+    "shaping": ("papers.shaping", "SAC by a sparse reward, and shaped by the cost"),
     "tacbench": ("papers.tacbench.benchmark", "force, slip, pose, grasp, cloth from frozen touch"),
     "real-touch": ("real_touch.videos", "encoders on labelled videos of real touch"),
     "real-words": ("real_touch.words", "hardness, roughness and bumpiness named by sentences"),

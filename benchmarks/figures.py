@@ -75,6 +75,22 @@ def grasps_found(metrics: Metrics) -> str:
     return "; ".join(f"{name} {SuccessRate(sum(done), len(done))}" for name, done in lifted)
 
 
+def grips_found(metrics: Metrics, trials: str) -> str:
+    """Searches that end with a force that neither loses nor crushes the rod, by reward."""
+    ends = {row: by_trials[trials] for row, by_trials in metrics["ends"].items()}
+    return "; ".join(f"{k} {SuccessRate(v.count('safe'), len(v))}" for k, v in ends.items())
+
+
+def learning_curves(metrics: Metrics) -> str:
+    """Success at the end of training and mean over all evaluations, all seeds together, by reward."""
+    found = []
+    for arm, curves in metrics["curves"].items():
+        rate = SuccessRate(sum(c[-1] for c in curves), metrics["trials"] * len(curves))
+        evaluations = metrics["trials"] * sum(map(len, curves))
+        found.append(f"{arm} {rate}, throughout {sum(map(sum, curves)) / evaluations:.2f}")
+    return "; ".join(found)
+
+
 def median_rate(metrics: Metrics, start: str, unit: str) -> str:
     """Range of the median rates of rows whose name begins with `start`."""
     rates = [row["median"] for row in metrics["rows"] if row["what"].startswith(start)]

@@ -1,11 +1,16 @@
 """Environments for reinforcement learning: Stable-Baselines3 trains on them as they are."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
+from in_process import run_benchmark
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_checker import check_env
 
 import touchgoal
+from benchmarks.papers import shaping
 from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.for_rl import TACTILE_SIZE
@@ -67,3 +72,23 @@ def test_several_at_once_with_touch() -> None:
         envs.step(envs.action_space.sample())
     finally:
         envs.close()
+
+
+@pytest.mark.slow
+def test_benchmark_shaping(tmp_path: Path) -> None:
+    """The scripted success is paid by both rewards; trainings on file are not made anew."""
+    sizes = "--ticks 60 --every 30 --trials 1 --goals 2 --seeds 1"
+    run_benchmark("shaping", *sizes.split(), "--out", tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert [len(curve) for curves in metrics["curves"].values() for curve in curves] == [2, 2]
+    sparse, shaped = (
+        shaping.training_env(shaping.Config(), tmp_path, arm) for arm in ("sparse", "shaped")
+    )
+    for env, least, most in ((sparse, 1.0, 1.0), (shaped, 1.5, 2.2)):
+        env.reset(seed=0)
+        paid, ended, script = [], False, iter(shaping.SCRIPT)
+        while not ended:
+            _, reward, ended, *_ = env.step(np.array(next(script)))
+            paid.append(reward)
+        assert least <= sum(paid) <= most
+        assert (max(paid[:-1]) > 0.1) == (env is shaped), "the touch is paid at once"

@@ -1,5 +1,6 @@
 """Fragile carry: what holds one rod crushes another, and slip says which one it is."""
 
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,3 +72,17 @@ def test_commands_from_demonstrations_to_a_table(tmp_path: Path, capsys) -> None
         *one, "--out", tmp_path / "table")  # fmt: skip
     printed = capsys.readouterr().out
     assert re.search("^state, force on the hand +0/1 ", printed, re.M)
+
+
+@pytest.mark.slow
+def test_a_grip_is_found_by_touch(tmp_path: Path) -> None:
+    """Of three forces the least loses this rod, and the largest crushes it unseen."""
+    sizes = "--rods 1 --seed 3895002 --forces 3 --goals 2 --searches 2 --samples 6 --workers 1"
+    run_benchmark("grip-search", *sizes.split(), "--out", tmp_path / "found")
+    found = json.loads((tmp_path / "found" / "metrics.json").read_text())
+    assert set(found["ends"]["touch"]["18"]) == {"safe"}
+    table = sorted((tmp_path / "found" / "trials").glob("rod-*"))
+    assert len(table) == 3
+    before = [file.stat().st_mtime_ns for file in table]
+    run_benchmark("grip-search", *sizes.split(), "--out", tmp_path / "found")
+    assert [file.stat().st_mtime_ns for file in table] == before, "kept, not recorded anew"

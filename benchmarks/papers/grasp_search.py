@@ -1,7 +1,7 @@
 """Grasp and lift found by trial: the cost at the end of each trial says where to grasp next.
 
-The cross-entropy method: grasps are sampled around a mean, the best third by the cost move it, and the
-last mean is tried once. The object's position is known to some centimetres only.
+The last mean of the cross-entropy method is tried once. The object's position is known to some
+centimetres only.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 
 from benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.papers.cross_entropy import Points, search
 from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
 from touchgoal.control.features import CAMERAS, TACTILE, WRENCH, Observation
 from touchgoal.episodes.schema import Episode
@@ -91,12 +92,13 @@ def _search(config: Config, job: tuple[int, str]) -> bool:
     rig = _Rig(config, HELD_OUT_OBJECTS[scene % len(HELD_OUT_OBJECTS)])
     if row != "first guess":
         goal = rig.goal(range(seed + 1000, seed + 1000 + 100 * config.goals, 100))
-        for _ in range(config.rounds):
-            shifts = rng.normal(mean, spread, (config.samples, 3))
-            ends = [rig.lift(seed, shift)[0] for shift in shifts]
-            costs = rng.random(len(ends)) if row == "chance" else rig.costs(ends, goal, row)
-            best = shifts[np.argsort(costs)[: max(config.samples // 3, 2)]]
-            mean, spread = best.mean(0), best.std(0)
+
+        def costs(shifts: Points) -> Sequence[float]:
+            if row == "chance":
+                return rng.random(len(shifts)).tolist()
+            return rig.costs([rig.lift(seed, shift)[0] for shift in shifts], goal, row)
+
+        mean = search(rng, mean, spread, config.rounds, config.samples, costs)
     _, lifted = rig.lift(seed, mean)
     rig.env.close()
     return lifted
