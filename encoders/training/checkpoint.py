@@ -16,9 +16,14 @@ from touchgoal.runtime.errors import UserError
 _CHECKPOINT, _METRICS = "checkpoint.pt", "metrics.jsonl"
 
 
+def can_resume(out_dir: Path) -> bool:
+    """Return whether a folder holds a training to resume."""
+    return (out_dir / _CHECKPOINT).is_file()
+
+
 def check_run_folder(out_dir: Path, resume: bool) -> None:
     """Raise UserError if there is nothing to resume, or a run would be overwritten."""
-    exists = (out_dir / _CHECKPOINT).is_file()
+    exists = can_resume(out_dir)
     if resume and not exists:
         raise UserError(f"nothing to resume in {out_dir}: start without resuming")
     if not resume and (exists or (out_dir / _METRICS).exists()):
