@@ -41,6 +41,7 @@ BENCHMARKS = {
         "papers.reward_use",
         "demonstrations weighted, checkpoints ranked by the reward",
     ),
+    "improve": ("papers.improve", "a policy improved by its own runs, by what accepts them"),
     "grasp-search": ("papers.grasp_search", "grasps found by trial on the cost"),
     "tacbench": ("papers.tacbench.benchmark", "force, slip, pose, grasp, cloth from frozen touch"),
     "real-touch": ("real_touch.videos", "encoders on labelled videos of real touch"),

@@ -97,11 +97,11 @@ def read_training(validation: Path, options: str, data: Path, out: Path) -> tupl
 
     It tries no snapshots, which would choose one by the simulator's verdict.
     """
-    from touchgoal.encoders.training.checkpoint import can_resume
+    from touchgoal.encoders.training.checkpoint import CHECKPOINT
     from touchgoal.launch.__main__ import read_options
 
     fixed = "--judged", "--trials", "0", "--data", data, "--validation", validation, "--out", out
-    resume = ["--resume"] * can_resume(out)
+    resume = ["--resume"] * (out / CHECKPOINT).is_file()
     return read_options("train-policy", [*shlex.split(options), *map(str, fixed), *resume])
 
 

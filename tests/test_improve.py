@@ -90,7 +90,7 @@ def test_no_decision_reads_the_simulators_verdict(
         assert not [key for key in keys or self.features if key.startswith("truth.")]
         return read(self, i, keys)
 
-    monkeypatch.setattr(improve, "_true", lambda *_: None)  # the report alone
+    monkeypatch.setattr(improve, "true_outcomes", lambda *_: None)  # the report alone
     monkeypatch.setattr(EpisodeSet, "read", guarded)
     told = "success", "failures", "outcome"
     monkeypatch.setattr(EpisodeSet, "meta", lambda self, i: {

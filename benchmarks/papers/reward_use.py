@@ -22,10 +22,9 @@ from benchmarks.papers.reward_quality.embedding import EmbeddedFiles
 from benchmarks.papers.reward_quality.judging import Judge, fit_judge
 from benchmarks.papers.reward_quality.recording import Recorded, Sizes, plan, record
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.episodes.recording import EpisodeSpec, collect
+from touchgoal.episodes.recording import collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import (
     ESTIMATOR,
     POLICY_FORMAT,
@@ -36,6 +35,7 @@ from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.evaluation.evaluate import Trial, run_trials, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.network import PolicyConfig
+from touchgoal.policies.training.improve import Acting
 from touchgoal.policies.training.model_selection import copy_parts
 from touchgoal.policies.training.sequence_dataset import (
     Recordings,
@@ -270,17 +270,6 @@ def _try(policy: Path, trials: int, workers: int) -> list[Trial]:
     return list(run_trials(env, maker, specs, workers))
 
 
-@dataclass(frozen=True)
-class _Acts:
-    """The policy in a folder, as `collect` asks for it."""
-
-    folder: Path
-
-    def __call__(self, env: Any, spec: EpisodeSpec) -> tuple[LearnedPolicy, LearnedPolicy]:
-        policy = SavedPolicy(self.folder)(env)
-        return policy, policy
-
-
 def _checkpoints(data: _Demonstrations, judge: Judge, config: Config) -> list[dict[str, float]]:
     """Return success, mean last cost of each curve, and validation error of every checkpoint."""
     windows = data.windows(_weights("successes alone", data, judge, config))
@@ -310,7 +299,7 @@ def _judge_rollouts(policy: Path, judge: Judge, config: Config, folder: Path) ->
     size = SavedPolicy(policy)().env_config(_TASK).camera_size
     env = replace(_TASK, cameras=("front", "wrist"), camera_size=size)
     specs = trial_specs(env, config.rollouts, seeds.POLICY_TEST.start + config.trials)
-    collect(folder, env, specs, config.workers, _Acts(policy))
+    collect(folder, env, specs, config.workers, Acting(SavedPolicy(policy)))
     episodes, files = EpisodeSet(folder), replace(judge.files, folder=folder / "embedded")
     recorded = [
         Recorded(folder, i, "test", "", str(episodes.meta(i)["object"]), "elsewhere")

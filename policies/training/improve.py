@@ -7,7 +7,7 @@ a simulator knows: success ends no run and chooses nothing; it is printed beside
 
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,7 +26,7 @@ from touchgoal.policies.training.training_data import choose_episodes
 from touchgoal.runtime import seeds
 from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.parallel.parallel_map import Workers
-from touchgoal.sim_envs.config import TASKS, TaskConfig, TaskName
+from touchgoal.sim_envs.config import TASKS, PickPlaceConfig, TaskConfig, TaskName
 
 HEAD = f"{'round':<6}{'judged success':>22}{'true success':>22}{'unsure':>8}"
 """Head of a table of rounds."""
@@ -86,7 +86,7 @@ class Improvement:
                 found = self.label(episodes)
                 write_judged(episodes, {i: found[i] for i in missing})
             judged, policy = read_judged(episodes), self._trained(number)
-            yield Round(number, [judged[i].verdict for i in rows], _true(episodes, rows))
+            yield Round(number, [judged[i].verdict for i in rows], true_outcomes(episodes, rows))
 
     def policy(self, number: int) -> Path:
         """Return the folder of the policy that a round ends with."""
@@ -112,7 +112,7 @@ class Improvement:
         return folder / POLICY
 
 
-def _true(episodes: EpisodeSet, rows: Sequence[int]) -> list[bool] | None:
+def true_outcomes(episodes: EpisodeSet, rows: Sequence[int]) -> list[bool] | None:
     """Return the simulator's verdicts, for the report alone; None where there is no simulator."""
     key = ft.TRUTH_SUCCESS
     if key not in episodes.features:
@@ -142,8 +142,7 @@ class Acting:
 
     def __call__(self, env: Any, spec: EpisodeSpec) -> tuple[Actor, Actor]:
         """Return the policy in both roles."""
-        actor = self.make(env)
-        return actor, actor
+        return (self.make(env),) * 2
 
 
 def record_simulated(
@@ -165,16 +164,17 @@ def simulation_of(demonstrations: EpisodeSet) -> TaskConfig | None:
     if task not in TASKS:
         return None
     cameras = [key for key in ft.CAMERAS if key in features]
-    options: dict[str, Any] = {
-        "cameras": tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in cameras),
-        "tactile": ft.TACTILE[0] in features,
-        "control_hz": demonstrations.fps,
-        "sensor": str(metas[0]["sensor"]),
-        "rest": _REST,
-        "ends_by_success": False,
-    }
-    if cameras:
-        options["camera_size"] = tuple(features[cameras[0]]["shape"][:2])
-    if task == "pick-place":
-        options["objects"] = tuple(dict.fromkeys(str(meta["object"]) for meta in metas))
-    return cast(TaskConfig, TASKS[cast(TaskName, task)](**options))
+    env = replace(
+        TASKS[cast(TaskName, task)](),
+        cameras=tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in cameras),
+        tactile=ft.TACTILE[0] in features,
+        control_hz=demonstrations.fps,
+        sensor=str(metas[0]["sensor"]),
+        rest=_REST,
+        ends_by_success=False,
+    )
+    for key in cameras:
+        env = replace(env, camera_size=tuple(features[key]["shape"][:2]))
+    if isinstance(env, PickPlaceConfig):
+        env = replace(env, objects=tuple(dict.fromkeys(str(meta["object"]) for meta in metas)))
+    return env
