@@ -37,7 +37,8 @@ class Config:
     policy: str | None = None
     """Folder of the policy of the first round; default: trained on the demonstrations."""
     train: str = "--preset sight"
-    """Options of train-policy, in one string. Every training begins with fresh weights."""
+    """Options of train-policy, in one string: --train="--preset sight". Every training begins with fresh
+    weights."""
     workers: Count = os.cpu_count() or 1
     """Processes that simulate."""
     out: Path | None = None
@@ -66,7 +67,7 @@ def main(config: Config) -> None:
     for done in work.rounds(config.rounds, policy):
         rounds.append(done)
         print(f"{improve.HEAD}\n{done}", flush=True)
-        figures = {name: [r.successes, *r.interval] for name, r in done.rates.items()}
+        figures = {f"{name}_success": [r.successes, *r.interval] for name, r in done.rates.items()}
         write_json(out / "metrics.json", {"rounds": [asdict(r) | figures for r in rounds]})
         improve.plot_rounds(rounds).savefig(out / "success.png")
     last = work.policy(config.rounds)

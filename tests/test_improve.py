@@ -126,7 +126,7 @@ def test_improve(
     env = simulation_of(EpisodeSet(demos))
     assert isinstance(env, PickPlaceConfig) and env.objects == ("cork",) and not env.ends_by_success
     run("improve", "--data", demos, "--validation", val, "--judge", tmp_path, "--rounds", 1, "--episodes", 2, "--workers", 1,
-        "--train", "--head tiny --representation delta --train.epochs 1 --workers 1", "--out", tmp_path / "out")  # fmt: skip
+        "--train=--head tiny --representation delta --train.epochs 1 --workers 1", "--out", tmp_path / "out")  # fmt: skip
     assert "1/2 [0.09, 0.91]" in capsys.readouterr().out
     episodes = EpisodeSet(tmp_path / "out" / "episodes")
     assert choose_judged(episodes).rows == [0, 1] and read_judged(episodes)[2].verdict == "unsure"

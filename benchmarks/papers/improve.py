@@ -6,6 +6,7 @@ counts if the block lies where it should at the end. What the folder of an earli
 """
 
 import shutil
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -97,7 +98,7 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
         f"{'filter':<8}{'success':>22}{'accepted':>10}{'of them right':>15}  right runs by round",
         f"{'before':<8}{before!s:>22}",
     ]
-    rows: dict[str, Any] = {}
+    rows: dict[str, list[dict[str, Any]]] = {"before": [{"successes": before.successes}]}
     for name in config.filters:
         if not (folder := out / name).exists():
             shutil.rmtree(out / "unfinished", ignore_errors=True)
@@ -109,10 +110,9 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
         after, (accepted, right) = success(work.policy(config.rounds)), _accepted(rounds)
         each = " ".join(str(sum(r.true or [])) for r in rounds)
         lines.append(f"{name:<8}{after!s:>22}{accepted:>10}{right:>15.0%}  {each}")
-        rows[name] = {"success": after.successes, "accepted": accepted, "right": right}
-        rows[name] |= {"verdicts": [r.verdicts for r in rounds], "true": [r.true for r in rounds]}
-    rows = {"before": {"success": before.successes}, **rows}
-    return {"table": "\n".join(lines), "trials": config.trials, "filters": rows}
+        known = {"accepted": accepted, "right": right, "rounds": [asdict(r) for r in rounds]}
+        rows[name] = [{"successes": after.successes, **known}]
+    return {"table": "\n".join(lines), "trials": config.trials, "imitation": rows}
 
 
 def _demonstrate(folder: Path, drawn: seeds.SeedRange, count: int, config: Config) -> Path:
