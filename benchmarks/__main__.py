@@ -41,6 +41,7 @@ BENCHMARKS = {
         "papers.reward_use",
         "demonstrations weighted, checkpoints ranked by the reward",
     ),
+    "improve": ("papers.improve", "a policy improved by its own runs, by what accepts them"),
     "grasp-search": ("papers.grasp_search", "grasps found by trial on the cost"),
     "grip-search": ("papers.grip_search", "grip force found by trial where a crush is not seen"),
     "shaping": ("papers.shaping", "SAC by a sparse reward, and shaped by the cost"),

@@ -21,6 +21,7 @@ COMMANDS = {
     "train-encoder": "train a touch encoder",
     "train-pose-estimator": "train the network that finds object and goal in a camera image",
     "train-policy": "train a policy on recorded episodes",
+    "improve": "a policy runs, a judge labels, it learns from what was accepted, round after round",
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "costs and rewards along episodes or plain videos",
     "fit-normalizer": "fit the normalizer of reward-curves on successful episodes of your own",

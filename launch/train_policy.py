@@ -29,8 +29,6 @@ from touchgoal.runtime.option_types import (
 from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, TaskConfig, TaskName
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.policies.network import PolicyConfig
     from touchgoal.policies.perception.frozen_touch import TouchEmbedder
@@ -64,7 +62,6 @@ _SIGHT = {
 
 _PROJECTION_DIM = {"default": 64, "sight": 64, "paper": 256}  # width of the touch projection
 _WARMUP_STEPS = {"default": 500, "sight": 300, "paper": 500}
-_PROGRESS_SECONDS = 1.0  # s in which the progress of a window is made
 
 
 @checked_dataclass
@@ -100,9 +97,9 @@ class Config(TrainingOptions):
     (joint positions) or relative (joint change since the episode's start)."""
     include_unknown: Annotated[bool, RARE] = False
     """Also train on episodes that do not say whether they succeeded."""
-    progress: Path | None = None
-    """touchgoal_progress.parquet that reward-curves wrote for --data: failed episodes are taken, too, and
-    what makes progress towards the goal is imitated (RA-BC)."""
+    judged: bool = False
+    """Train on the episodes that a judge or a person accepted (touchgoal judge), whatever outcome was
+    recorded; those judged failure or unsure are left out."""
     trim_pauses: bool = False
     """Leave out the frames of each episode before arm or gripper first move."""
     task: str | None = None
@@ -195,11 +192,13 @@ def main(config: Config) -> None:
         load_pose_estimator(config.estimator)
         parts[ESTIMATOR] = config.estimator
     sets = open_sets(config.data, config.validation, parse_keys(config.keys))
-    unknown, failed = config.include_unknown, config.progress is not None
-    found = [
-        training_data.choose_episodes(sets[0], unknown, failed),
-        training_data.choose_episodes(sets[1], unknown),
-    ]
+    unknown = config.include_unknown
+    first = (
+        training_data.choose_judged(sets[0])
+        if config.judged
+        else training_data.choose_episodes(sets[0], unknown)
+    )
+    found = [first, training_data.choose_episodes(sets[1], unknown)]
     rows = [f.rows for f in found]
     rows[0] = rows[0][: max(1, round(config.share * len(rows[0])))]
     chosen = list(zip(sets, rows, strict=True))
@@ -226,10 +225,7 @@ def main(config: Config) -> None:
         sequence_dataset.load_recordings(s, r, policy, touch, workers, skip, config.actions)
         for (s, r), skip in zip(chosen, skipped, strict=True)
     )
-    first, other = recordings
-    weights = _weights(config, sets[0], rows[0], skipped[0]) if config.progress else None
-    windows = sequence_dataset.SequenceDataset(first, policy, weights)
-    validation = sequence_dataset.SequenceDataset(other, policy)
+    windows, validation = (sequence_dataset.SequenceDataset(r, policy) for r in recordings)
     print(f"{len(windows)} windows of {len(rows[0])} episodes; {len(validation)} for validation")
     provenance = recipe(*sets) | {"episodes": len(rows[0])}
     warmup = _WARMUP_STEPS[config.preset]
@@ -283,19 +279,6 @@ def _policy_config(
         control_hz=episodes.fps,
         head=head,
     )
-
-
-def _weights(
-    config: Config, episodes: "EpisodeSet", rows: list[int], skip: list[int] | None
-) -> "np.ndarray":
-    from touchgoal.policies.training.progress_weights import progress_weights, read_progress
-
-    assert config.progress is not None
-    progress = read_progress(config.progress, rows, [episodes.lengths[i] for i in rows])
-    progress = [p[n:] for p, n in zip(progress, skip or [0] * len(rows), strict=True)]
-    weights = progress_weights(progress, round(_PROGRESS_SECONDS * episodes.fps))
-    print(f"imitated: {(weights > 0).mean():.0%} of the windows, which make progress")
-    return weights
 
 
 def _image_input(config: Config, episodes: "EpisodeSet") -> "ImageInputConfig | None":

@@ -48,6 +48,7 @@ POSE_TRAINING = SeedRange(4_000_000, 900_000)  # scenes that a pose estimator le
 POSE_VALIDATION = SeedRange(4_900_000, _STEP)
 POLICY_TEST = SeedRange(5_000_000, 1_000_000)  # benchmark policy-delay, bead-maze
 DEPLOY_TEST = SeedRange(6_000_000, 2_000_000)  # benchmark deploy
+IMPROVEMENT = SeedRange(8_000_000, 1_000_000)  # runs of improve that a policy is trained on
 DEMO = SeedRange(9_000_000, 1_000_000)
 
 WIRES: dict[str, SeedRange] = {  # shapes of wires have seeds apart from the episodes'

@@ -172,6 +172,8 @@ class EnvConfig(SceneConfig):
     """Time limit of an episode, s."""
     rest: Annotated[NotNegative, FIXED] = 0.0
     """Time recorded after an episode's end, in which the hand holds still, s."""
+    ends_by_success: Annotated[bool, FIXED] = True
+    """End an episode at success; without, it goes on, as where nobody knows."""
     disturbance: Annotated[NotNegative, Field(le=0.1)] = 0.0
     """Random hand motion added to each action, so that demonstrations show recoveries (DART, Laskey
     2017): RMS speed along each axis, m/s. The hand also turns, at 2 rad/s (in bead-maze 20 rad/s) per

@@ -18,6 +18,7 @@ from toy_episodes import record
 from touchgoal.control import features as ft
 from touchgoal.control.sensors.clip import read_frames
 from touchgoal.encoders.training.weights import WeightsFormat
+from touchgoal.episodes.outcomes.judged import JudgedOutcome, write_judged
 from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
@@ -35,7 +36,12 @@ from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.sight.frozen_images import ImageEmbedder, ImageInputConfig
 from touchgoal.policies.training.embedding_cache import embed_episodes
-from touchgoal.policies.training.training_data import choose_episodes, common_sensor, find_task
+from touchgoal.policies.training.training_data import (
+    choose_episodes,
+    choose_judged,
+    common_sensor,
+    find_task,
+)
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.deployment import DeploymentConfig
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
@@ -321,6 +327,13 @@ def test_only_what_is_known_to_be_good_is_learned_from(tmp_path: Path) -> None:
     assert chosen.rows == [0, 2]
     assert str(chosen) == "2 episodes (1 that failed, 1 of unknown success left out)"
     assert choose_episodes(episodes, include_unknown=True).rows == [0, 2, 3]
+    with pytest.raises(UserError, match="4 of 4 .* not judged: judge it first: touchgoal judge"):
+        choose_judged(episodes)
+    verdicts = ("failure", "success", "unsure", "success")
+    write_judged(episodes, {i: JudgedOutcome(v) for i, v in enumerate(verdicts)})
+    chosen = choose_judged(episodes)
+    assert chosen.rows == [1, 3], "whatever was recorded"
+    assert str(chosen) == "2 episodes (1 that failed, 1 judged unsure left out)"
     writer = EpisodeWriter(tmp_path / "arm")
     writer.append(Episode(frames, "feel", {"outcome": "stopped", "sensor": "digit"}))
     arm = EpisodeSet(tmp_path / "arm")

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import torch
 from toy_policies import (
@@ -36,7 +34,6 @@ from touchgoal.policies.heads.samplers import FLOW_TIME_SCALE, denoise
 from touchgoal.policies.heads.unet import PRESETS, UNet
 from touchgoal.policies.network import PolicyConfig
 from touchgoal.policies.training import train as train_module
-from touchgoal.policies.training.progress_weights import progress_weights, read_progress
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import train
 from touchgoal.policies.training.training_data import find_pauses, report_pauses
@@ -65,29 +62,6 @@ def test_windows_stay_inside_their_episode() -> None:
     for i, rows in ((1, [2] * 8), (2, range(3, 11)), (3, [22] * 8)):
         torch.testing.assert_close(actions[i], done[list(rows)])
     torch.testing.assert_close(windows.actions[3], actions[2])
-
-
-def test_what_makes_progress_is_drawn_and_what_loses_it_is_not(tmp_path: Path) -> None:
-    table = {
-        "episode_index": [4] * 3 + [7] * 20,
-        "frame_index": [*range(3), *range(20)],
-        "progress_sparse": np.r_[0.5, 0.5, 0.5, np.linspace(0, 1, 10), np.linspace(1, 0, 10)],
-    }
-    pq.write_table(pa.table(table), path := tmp_path / "progress.parquet")
-    progress = read_progress(path, [4, 7], [3, 20])
-    weights = progress_weights(progress, ahead=2)
-    assert (weights[3:11] == 1).all() and (weights[13:] == 0).all()
-    assert ((weights[:2] > 0) & (weights[:2] < 1)).all(), "without progress: in part"
-    assert weights[2] == 0, "no action follows the last frame"
-    with pytest.raises(UserError, match="no frame of --data makes progress"):
-        progress_weights([np.linspace(1, 0, 9), np.linspace(0.5, 0.1, 9)], ahead=2)
-    drawn = SequenceDataset(toy_dataset(TOY, (3, 20)).recorded, TOY, weights).draw(
-        torch.arange(23).repeat(200), BatchNoise(torch_rng())
-    )
-    shares = drawn.bincount(minlength=23) / len(drawn)
-    np.testing.assert_allclose(shares, weights / weights.sum(), atol=0.015)
-    with pytest.raises(UserError, match="the 5 frames of episode 4"):
-        read_progress(path, [4], [5])
 
 
 @pytest.mark.parametrize("head", [DIFFUSION, FLOW, MLPConfig(64, 2)])

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from pydantic import Field
 from scipy.stats import spearmanr
 
@@ -22,10 +22,9 @@ from benchmarks.papers.reward_quality.embedding import EmbeddedFiles
 from benchmarks.papers.reward_quality.judging import Judge, fit_judge
 from benchmarks.papers.reward_quality.recording import Recorded, Sizes, plan, record
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.episodes.recording import EpisodeSpec, collect
+from touchgoal.episodes.recording import collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import (
     ESTIMATOR,
     POLICY_FORMAT,
@@ -36,8 +35,8 @@ from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.evaluation.evaluate import Trial, run_trials, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.network import PolicyConfig
+from touchgoal.policies.training.improve import Acting
 from touchgoal.policies.training.model_selection import copy_parts
-from touchgoal.policies.training.progress_weights import progress_weights
 from touchgoal.policies.training.sequence_dataset import (
     Recordings,
     SequenceDataset,
@@ -55,6 +54,7 @@ from touchgoal.sim_envs.config import PickPlaceConfig
 _ESTIMATOR = SHIPPED_POLICIES["pick-place"] / ESTIMATOR
 _TASK = PickPlaceConfig(objects=HELD_OUT_OBJECTS)
 ACCEPTED = "accepted by "
+_IN_FULL = 0.01  # progress above which a frame counts in full: kappa of RA-BC
 _EPOCHS_APART = 2  # between two checkpoints that are ranked
 Weights = Literal[
     "none",
@@ -66,7 +66,7 @@ Weights = Literal[
     "accepted by image",
     "accepted by tactile",
 ]
-"""Weights of the demonstrations: none; 1 for successes, 0 for others; those of `progress_weights` by a
+"""Weights of the demonstrations: none; 1 for successes, 0 for others; those of `_progress_weights` by a
 cost (RA-BC); 1 where the last cost is below a success threshold, else 0."""
 
 
@@ -181,7 +181,25 @@ def _weights(name: str, data: _Demonstrations, judge: Judge, config: Config) -> 
         accepted = _accepted(judge, data, name.removeprefix(ACCEPTED))
         return np.repeat(accepted, lengths).astype(np.float32)
     progress = [_progress(judge, r, name, n) for r, n in zip(data.recorded, lengths, strict=True)]
-    return progress_weights(progress, config.seconds * data.policy.control_hz)
+    return _progress_weights(progress, config.seconds * data.policy.control_hz)
+
+
+def _progress_weights(
+    progress: Sequence[Float[np.ndarray, " _"]], ahead: int
+) -> Float32[np.ndarray, " n"]:
+    """Return a weight in [0, 1] for every frame, by the progress of its episode in the next `ahead`.
+
+    Reward-aligned behaviour cloning (RA-BC) of SARM (Chen et al. 2025, arXiv:2509.25358, eq. 8 and
+    9), as lerobot computes it: frames with progress count in full, those that lose it not at all.
+    """
+    later = [np.minimum(np.arange(len(p)) + ahead, len(p) - 1) for p in progress]
+    gain = np.concatenate([p[to] - p for p, to in zip(progress, later, strict=True)])
+    mean, spread = max(gain.mean(), 0.0), max(gain.std(), 1e-6)
+    weights = np.clip((gain - mean + 2 * spread) / (4 * spread), 0, 1)
+    weights[gain > _IN_FULL] = 1
+    weights[gain < 0] = 0
+    weights[np.cumsum([len(p) for p in progress]) - 1] = 0  # no action follows the last frame
+    return weights.astype(np.float32)
 
 
 def _accepted(judge: Judge, data: _Demonstrations, curve: str) -> list[bool]:
@@ -252,17 +270,6 @@ def _try(policy: Path, trials: int, workers: int) -> list[Trial]:
     return list(run_trials(env, maker, specs, workers))
 
 
-@dataclass(frozen=True)
-class _Acts:
-    """The policy in a folder, as `collect` asks for it."""
-
-    folder: Path
-
-    def __call__(self, env: Any, spec: EpisodeSpec) -> tuple[LearnedPolicy, LearnedPolicy]:
-        policy = SavedPolicy(self.folder)(env)
-        return policy, policy
-
-
 def _checkpoints(data: _Demonstrations, judge: Judge, config: Config) -> list[dict[str, float]]:
     """Return success, mean last cost of each curve, and validation error of every checkpoint."""
     windows = data.windows(_weights("successes alone", data, judge, config))
@@ -292,7 +299,7 @@ def _judge_rollouts(policy: Path, judge: Judge, config: Config, folder: Path) ->
     size = SavedPolicy(policy)().env_config(_TASK).camera_size
     env = replace(_TASK, cameras=("front", "wrist"), camera_size=size)
     specs = trial_specs(env, config.rollouts, seeds.POLICY_TEST.start + config.trials)
-    collect(folder, env, specs, config.workers, _Acts(policy))
+    collect(folder, env, specs, config.workers, Acting(SavedPolicy(policy)))
     episodes, files = EpisodeSet(folder), replace(judge.files, folder=folder / "embedded")
     recorded = [
         Recorded(folder, i, "test", "", str(episodes.meta(i)["object"]), "elsewhere")

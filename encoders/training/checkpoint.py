@@ -13,12 +13,12 @@ from torch import Tensor
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 
-_CHECKPOINT, _METRICS = "checkpoint.pt", "metrics.jsonl"
+CHECKPOINT, _METRICS = "checkpoint.pt", "metrics.jsonl"
 
 
 def check_run_folder(out_dir: Path, resume: bool) -> None:
     """Raise UserError if there is nothing to resume, or a run would be overwritten."""
-    exists = (out_dir / _CHECKPOINT).is_file()
+    exists = (out_dir / CHECKPOINT).is_file()
     if resume and not exists:
         raise UserError(f"nothing to resume in {out_dir}: start without resuming")
     if not resume and (exists or (out_dir / _METRICS).exists()):
@@ -58,7 +58,7 @@ class Record:
     def write(self, history: list[dict[str, float]], state: Mapping[str, Any]) -> None:
         """Write the state after an epoch; a kill leaves the old or the new checkpoint, whole."""
         states = {name: part.state_dict() for name, part in state.items()}
-        with atomic_write(self._dir / _CHECKPOINT) as unfinished:
+        with atomic_write(self._dir / CHECKPOINT) as unfinished:
             torch.save({**self._head, "history": history, **states}, unfinished)
         lines = "".join(json.dumps(epoch) + "\n" for epoch in history)
         (self._dir / _METRICS).write_text(lines)
@@ -87,7 +87,7 @@ def load(
         state: Modules, optimizers and the like, by name; loaded to the device of each.
         provenance: Provenance of the resumption, added if it differs.
     """
-    path = out_dir / _CHECKPOINT
+    path = out_dir / CHECKPOINT
     try:
         found = torch.load(path, "cpu", weights_only=True)
         old, history, recorded = found["identity"], found["history"], found["provenance"]

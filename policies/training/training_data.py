@@ -8,6 +8,7 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.faults import leave_out_faulty
+from touchgoal.episodes.outcomes.judged import read_judged
 from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
@@ -27,26 +28,25 @@ class ChosenEpisodes:
 
     rows: list[int]  # their indices
     failed: int  # number of failed ones, which are left out
-    unknown: int  # number of those left out because their success is not recorded
+    unknown: int = 0  # number of those left out because their success is not recorded
+    unsure: int = 0  # number of those left out because the judge was unsure
 
     def __str__(self) -> str:
         left = [f"{self.failed} that failed"] * bool(self.failed)
         left += [f"{self.unknown} of unknown success"] * bool(self.unknown)
+        left += [f"{self.unsure} judged unsure"] * bool(self.unsure)
         return f"{len(self.rows)} episodes" + (f" ({', '.join(left)} left out)" if left else "")
 
 
-def choose_episodes(
-    episodes: EpisodeSet, include_unknown: bool = False, include_failed: bool = False
-) -> ChosenEpisodes:
+def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> ChosenEpisodes:
     """Return the episodes that succeeded, and those in which an expert corrected a policy.
 
     `include_unknown` also takes those that do not say whether they succeeded, such as recordings of
-    an arm, `include_failed` those that failed. Faulty ones are left out and listed. UserError: none
-    is left.
+    an arm. Faulty ones are left out and listed. UserError: none is left.
     """
-    known = [include_failed or succeeded(episodes.meta(i)) for i in range(len(episodes))]
+    known = [succeeded(episodes.meta(i)) for i in range(len(episodes))]
     rows = [i for i, good in enumerate(known) if good or (good is None and include_unknown)]
-    rows = leave_out_faulty(episodes, rows, [key for key in _READ if key in episodes.features])
+    rows = _sound(episodes, rows)
     unknown = 0 if include_unknown else known.count(None)
     chosen = ChosenEpisodes(rows, known.count(False), unknown)
     if not rows:
@@ -58,6 +58,24 @@ def choose_episodes(
             f"unknown success): {remedy}"
         )
     return chosen
+
+
+def choose_judged(episodes: EpisodeSet) -> ChosenEpisodes:
+    """Return the episodes that were judged successes; their recorded outcomes are not read.
+
+    Faulty ones are left out and listed. UserError: an episode was not judged, or none is left.
+    """
+    judged = read_judged(episodes)
+    if missing := len(episodes) - len(judged.keys() & set(range(len(episodes)))):
+        raise UserError(
+            f"{missing} of {len(episodes)} episodes of {episodes.root} were not judged: judge it "
+            f"first: touchgoal judge {episodes.root}"
+        )
+    verdicts = [judged[i].verdict for i in range(len(episodes))]
+    rows = _sound(episodes, [i for i, verdict in enumerate(verdicts) if verdict == "success"])
+    if not rows:
+        raise UserError(f"no episode of {episodes.root} was judged a success: record more of them")
+    return ChosenEpisodes(rows, verdicts.count("failure"), unsure=verdicts.count("unsure"))
 
 
 def leading_pause(episode: Episode, meaning: ActionMeaning = "change") -> int:
@@ -109,6 +127,11 @@ def find_task(chosen: Sequence[tuple[EpisodeSet, Sequence[int]]], task: str | No
             f"{root} does not name its task: add --task {', '.join(TASKS)} or a name of your own"
         )
     return found or str(task)
+
+
+def _sound(episodes: EpisodeSet, rows: Sequence[int]) -> list[int]:
+    read = [key for key in _READ if key in episodes.features]
+    return leave_out_faulty(episodes, rows, read)
 
 
 def succeeded(meta: Mapping[str, Any]) -> bool | None:

@@ -177,7 +177,8 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         failed = bool(self.failures())
         success = success and not failed
         info = self._info(progress, success)
-        return observation, progress - before, success or failed, truncated, info
+        ends = failed or (success and self.config.ends_by_success)
+        return observation, progress - before, ends, truncated, info
 
     def render(self) -> UInt8[np.ndarray, "h w 3"]:
         """Render the side camera, 480 x 640 RGB; raises ResetNeeded before the first episode."""
