@@ -37,6 +37,10 @@ BENCHMARKS = {
         "papers.reward_quality.benchmark",
         "dense costs against outcomes (MMWand V-E)",
     ),
+    "reward-judge": (
+        "papers.reward_judge",
+        "success told from failure in runs of other hands than the fitted one",
+    ),
     "reward-use": (
         "papers.reward_use",
         "demonstrations weighted, checkpoints ranked by the reward",

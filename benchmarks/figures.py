@@ -60,6 +60,13 @@ def reward_kinds(metrics: Metrics, scene: str) -> str:
     return f"{figure('fused')} fused, {figure('image+tactile')} plain distance"
 
 
+def judged(metrics: Metrics) -> str:
+    """Least precision over hands and fits, and the kind that is told worst."""
+    name, row = min(metrics["rates"].items(), key=lambda r: r[1]["precision"])
+    kind, worst = min(metrics["kinds"].items(), key=lambda r: r[1]["auc"])
+    return f"precision {row['precision']:.2f} ({name}); AUC {worst['auc']:.2f} ({kind})"
+
+
 def imitated(metrics: Metrics) -> str:
     """Success of policies whose demonstrations were weighted by each reward, all seeds together."""
     found = {

@@ -18,7 +18,7 @@ from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.features.embedded import FINGERTIPS, TOUCH, EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.features.embedding_cache import embed_trajectory
 from touchgoal.rewards.metrics import auc, measure_curve
-from touchgoal.rewards.reward import PreparedReward
+from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track

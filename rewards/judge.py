@@ -88,7 +88,12 @@ class Judge:
         """Return the judgement of an end."""
         worst = sorted(parts, key=lambda name: -parts[name])
         return Judgement(
-            self.verdict(cost), cost, parts, tuple(_SAYS.get(n, _SAYS["wrist"].replace("wrist", n)) for n in worst if parts[n] > _FAR)
+            self.verdict(cost),
+            cost,
+            parts,
+            tuple(
+                _SAYS.get(n, _SAYS["wrist"].replace("wrist", n)) for n in worst if parts[n] > _FAR
+            ),
         )
 
     def corrected(self, cost: float, success: bool) -> "Judge":

@@ -20,10 +20,11 @@ from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_trajectory, kept_file
 from touchgoal.rewards.goals import Inputs, content_checksum
+from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.report.record import record_of
 from touchgoal.rewards.report.report import write_report
 from touchgoal.rewards.report.thumbnails import Thumbnails
-from touchgoal.rewards.reward import PreparedReward, Reward
+from touchgoal.rewards.reward import Reward
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 from touchgoal.rewards.sources.trajectory import Skipped, Trajectory, read_ahead
 from touchgoal.runtime.atomic_write import write_file

@@ -29,7 +29,8 @@ from touchgoal.rewards.features.successful_ends import GOAL_FILE
 from touchgoal.rewards.goals import GoalFile, Inputs, parse_goal, same_episode
 from touchgoal.rewards.judge import FIT_JUDGE, JUDGE, Judgement
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.reward import PreparedReward, Reward
+from touchgoal.rewards.prepared_reward import PreparedReward
+from touchgoal.rewards.reward import Reward
 from touchgoal.runtime.errors import UserError
 
 _FIRST_COST_TIMEOUT = 60.0  # s for the first cost, which warms up the networks

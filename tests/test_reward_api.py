@@ -41,8 +41,9 @@ from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
 from touchgoal.rewards.goals import GoalImage, Inputs, Sentence, assign_goals, parse_goal
 from touchgoal.rewards.judge import JUDGE, Judge
 from touchgoal.rewards.online import CostMeter, OnlineCost, load_cell_cost
+from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.report.plot import plot
-from touchgoal.rewards.reward import PreparedReward, Reward
+from touchgoal.rewards.reward import Reward
 from touchgoal.runtime.errors import UserError
 
 EPISODE = recorded()

@@ -96,8 +96,7 @@ def _other_failures(
     folder: Path, other: Sequence[Recorded], failures: int, workers: int
 ) -> list[End]:
     """Return ends of failures with the training objects, of the scripted and of the feedback expert."""
-    kinds = [k for k in KINDS if k != "overgripped"]
-    first = {kind: _OTHER_FAILURES + 1000 * i for i, kind in enumerate(kinds)}
+    first = {kind: _OTHER_FAILURES + 1000 * i for i, kind in enumerate(KINDS)}
     wanted = [
         EpisodeBatch("test", k, max(1, failures // 2), TRAINING_OBJECTS, s)
         for k, s in first.items()
@@ -174,7 +173,7 @@ def _policy_runs(
 ) -> list[Recorded]:
     shipped = SHIPPED_POLICIES["pick-place"]
     config, right = checkpoint.load(shipped).config, [r for r in taught if r.outcome == "success"]
-    if not (folder / "training" / "metrics.json").exists():
+    if not (folder / "training" / POLICY).exists():
         n = len(right) * 5 // 6
         sets = EpisodeSet(right[0].root)
         windows, validation = (

@@ -44,7 +44,6 @@ from touchgoal.policies.training.sequence_dataset import (
 )
 from touchgoal.policies.training.train import POLICY, SNAPSHOTS, train
 from touchgoal.rewards.curves import FUSED
-from touchgoal.rewards.success import fit_success
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.runtime.parallel.parallel_map import parallel_map
@@ -54,6 +53,7 @@ from touchgoal.sim_envs.config import PickPlaceConfig
 _ESTIMATOR = SHIPPED_POLICIES["pick-place"] / ESTIMATOR
 _TASK = PickPlaceConfig(objects=HELD_OUT_OBJECTS)
 ACCEPTED = "accepted by "
+_KEPT = 0.8  # share of right ones that a limit accepts
 _IN_FULL = 0.01  # progress above which a frame counts in full: kappa of RA-BC
 _EPOCHS_APART = 2  # between two checkpoints that are ranked
 Weights = Literal[
@@ -62,12 +62,13 @@ Weights = Literal[
     "fused",
     "image",
     "tactile",
-    "accepted by fused",
+    "accepted by judge",
     "accepted by image",
     "accepted by tactile",
 ]
 """Weights of the demonstrations: none; 1 for successes, 0 for others; those of `_progress_weights` by a
-cost (RA-BC); 1 where the last cost is below a success threshold, else 0."""
+cost (RA-BC); 1 where the end is no dearer than
+four of five right ones, else 0."""
 
 
 @checked_dataclass
@@ -203,14 +204,16 @@ def _progress_weights(
 
 
 def _accepted(judge: Judge, data: _Demonstrations, curve: str) -> list[bool]:
-    """Return which episodes the cost takes for successes, by a threshold from right demonstrations."""
+    """Return which episodes end no dearer than four of five right ones: by an end's cost, or a curve's."""
 
     def last(r: Recorded) -> float:
+        if curve == "judge":
+            return judge.end_cost(r)
         return float(judge.costs(judge.files.load(r), r.object)[curve][-1])
 
     right = [r for r, good in zip(data.right, _good(data.right), strict=True) if good]
-    threshold = fit_success([last(r) for r in right])
-    return [threshold.accepts(last(r)) for r in data.recorded]
+    limit = np.quantile([last(r) for r in right], _KEPT)
+    return [last(r) <= limit for r in data.recorded]
 
 
 def _progress(judge: Judge, r: Recorded, curve: str, length: int) -> Float[np.ndarray, " n"]:

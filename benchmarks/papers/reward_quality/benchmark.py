@@ -40,9 +40,7 @@ from benchmarks.papers.reward_quality.recording import (
     record,
 )
 from touchgoal.rewards.audit import audit_touch
-from touchgoal.rewards.curves import FUSED
 from touchgoal.rewards.report.tables import metrics_table
-from touchgoal.rewards.success import check_demonstrations, fit_success
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig
 
@@ -71,7 +69,6 @@ class Config(BenchmarkOptions, Sizes):
 
 def run(config: Config) -> dict[str, Any]:
     """Record, embed, measure and judge."""
-    check_demonstrations(config.calibration)
     if config.out is not None:
         return _run(config, config.out)
     with tempfile.TemporaryDirectory() as folder:
@@ -115,7 +112,6 @@ def _judge_scene(judge: Judge, recorded: Sequence[Recorded]) -> tuple[dict[str, 
     }
     margins = _margins(judge, test, curves)
     demonstrations = judge.judge([r for r in recorded if r.purpose == "calibration"])
-    threshold, passed = _threshold(demonstrations, judged)
     stopping = judge_stopping(demonstrations, judged, judge.files.load(test[0]).fps)
     audited = [r for r in test if r.outcome in _AUDITED]
     audit = audit_touch(
@@ -132,7 +128,6 @@ def _judge_scene(judge: Judge, recorded: Sequence[Recorded]) -> tuple[dict[str, 
             tables.grid("rank correlation of falling cost with time", ranks),
             tables.intervals(found | ordered, curves),
             tables.diagonals(margins),
-            tables.threshold(threshold, passed),
             stopping_text(stopping),
             audit.table,
             text,
@@ -144,7 +139,6 @@ def _judge_scene(judge: Judge, recorded: Sequence[Recorded]) -> tuple[dict[str, 
         "order": tables.as_json(ordered),
         "rank": tables.as_json(ranks),
         "diagonal": margins,
-        "success": vars(threshold) | {"accepted": passed},
         "early_stopping": stopping,
         "audit": {"verdict": audit.verdict, "rows": [vars(row) for row in audit.rows]},
         "claims": [vars(c) for c in claims],
@@ -168,17 +162,6 @@ def _margins(
         margin, nearest = diagonal(table)
         found[curve] = {"margin": margin, "nearest": nearest, "objects": float(len(chosen))}
     return found
-
-
-def _threshold(
-    demonstrations: Sequence[Judged], judged: dict[str, list[Judged]]
-) -> tuple[Any, dict[str, float]]:
-    """Return the success threshold, and the share of each outcome that it accepts."""
-    threshold = fit_success([e.last(FUSED) for e in demonstrations])
-    return threshold, {
-        outcome: float(np.mean([threshold.accepts(e.last(FUSED)) for e in episodes]))
-        for outcome, episodes in judged.items()
-    }
 
 
 def _paper(

@@ -1,7 +1,7 @@
 """Curves of embedded episodes to the ends of other successes with the same object."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
+from touchgoal.rewards.end_state import end_cost, end_costs
 from touchgoal.rewards.features.embedded import (
     IMAGE,
     TEXT,
@@ -21,6 +22,7 @@ from touchgoal.rewards.features.embedded import (
     EmbeddedGoal,
     last_rows,
 )
+from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.goals import OwnFrame, Sentence
 from touchgoal.rewards.value import Value, fit_value
 from touchgoal.runtime.errors import UserError
@@ -38,6 +40,7 @@ class Judge:
     value: Value
     goals: dict[str, EmbeddedGoal]  # by object
     sentences: dict[str, EmbeddedGoal]  # the same with a sentence for touch; empty without words
+    ends: SuccessfulEnds  # the goals of all objects
 
     def curves(self, episode: EmbeddedEpisode, goal: EmbeddedGoal) -> Curves:
         """Return the curves of an episode to a goal."""
@@ -55,6 +58,12 @@ class Judge:
             words = self.plain_curves(episode, self.sentences[name]).costs
             costs |= {curve: words[curve] for curve in ("text", "image+text")}
         return costs
+
+    def end_cost(self, recorded: Recorded) -> float:
+        """Return the cost of an episode's end, as a judge reads it."""
+        e = replace(self.files.load(recorded), object=recorded.object)
+        goal = self.ends.for_trajectory(e, "ends of successes")
+        return end_cost(end_costs(e.features, e.fps, goal, self.normalizer.unit, self.value))
 
     def judge(self, recorded: Sequence[Recorded]) -> list[Judged]:
         """Measure episodes against the goals of the object that was asked for."""
@@ -104,7 +113,12 @@ def fit_judge(files: EmbeddedFiles, recorded: Sequence[Recorded]) -> Judge:
         if r.object not in goals and r.purpose == "test":
             raise UserError(f"no goal for {r.object}: its expert always failed; see {r.root}")
     return Judge(
-        files, normalizer, fit_value(training, _SCENE), goals, _sentences(files.encoder, goals)
+        files,
+        normalizer,
+        fit_value(training, _SCENE),
+        goals,
+        _sentences(files.encoder, goals),
+        SuccessfulEnds.of([e for found in ends.values() for e in found]),
     )
 
 

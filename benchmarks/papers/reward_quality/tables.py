@@ -5,7 +5,6 @@ from typing import Any
 
 from benchmarks.papers.reward_quality.measures import Estimate, Judged
 from touchgoal.rewards.report.tables import aligned
-from touchgoal.rewards.success import SuccessThreshold
 
 Grid = Mapping[str, Mapping[str, Estimate]]  # figures by row and curve
 
@@ -44,12 +43,6 @@ def diagonals(margins: Mapping[str, Mapping[str, float]]) -> str:
     table += [[c, f"{m['margin']:.2f}", f"{m['nearest']:.2f}"] for c, m in margins.items()]
     title = f"goals by trajectories, one success of each of {objects:.0f} objects"
     return "\n".join([title, *aligned(table)])
-
-
-def threshold(fitted: SuccessThreshold, accepted: Mapping[str, float]) -> str:
-    """Return the threshold of success and what it accepts."""
-    shares = ", ".join(f"{outcome} {share:.2f}" for outcome, share in accepted.items())
-    return f"{fitted}\nshare accepted: {shares}"
 
 
 def as_json(rows: Grid) -> dict[str, dict[str, Any]]:
