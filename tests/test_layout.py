@@ -17,12 +17,12 @@ from touchgoal.launch.__main__ import COMMANDS
 
 # Ceilings fall with every change that removes, and rise only by the budget that an issue names,
 # in a change that says so.
-WHEEL_LINES = 49_930  # of Python
-REPOSITORY_LINES = 61_080  # of Python, outside tests/
-TEST_LINES = 18_720  # of Python
+WHEEL_LINES = 51_000  # of Python
+REPOSITORY_LINES = 63_370  # of Python, outside tests/
+TEST_LINES = 19_060  # of Python
 PAGE_WORDS = 12_000  # README, CHANGELOG and docs/*.md
-COMMANDS_IN_ALL = 33  # sub-commands included
-OPTIONS_IN_ALL = 395  # of all commands, each with its own
+COMMANDS_IN_ALL = 34  # sub-commands included
+OPTIONS_IN_ALL = 405  # of all commands, each with its own
 
 ROOT = Path(__file__).parents[1]
 _PAGE = (ROOT / "CONTRIBUTING.md").read_text()
