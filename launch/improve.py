@@ -50,7 +50,7 @@ def main(config: Config) -> None:
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.policies.checkpoint import find_policy
     from touchgoal.policies.training import improve
-    from touchgoal.rewards.judge import JUDGE, Judge
+    from touchgoal.rewards.judging.judge import JUDGE, Judge
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.run_folder import open_run
 

@@ -20,7 +20,7 @@ from touchgoal.runtime.option_types import RARE, checked_dataclass
 
 if TYPE_CHECKING:
     from touchgoal.episodes.outcomes.judged import JudgedOutcome
-    from touchgoal.rewards.judge import Judge, Judgement
+    from touchgoal.rewards.judging.judge import Judge, Judgement
     from touchgoal.rewards.report.judged_page import JudgedEnd
     from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 
@@ -52,7 +52,7 @@ def main(config: Config) -> None:
     from touchgoal.rewards.features.embedding_cache import embed_end
     from touchgoal.rewards.features.successful_ends import GOAL_FILE
     from touchgoal.rewards.goals import GoalFile
-    from touchgoal.rewards.judge import JUDGE, Judgement
+    from touchgoal.rewards.judging.judge import JUDGE, Judgement
     from touchgoal.rewards.measure import write_skipped
     from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory

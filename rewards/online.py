@@ -27,7 +27,7 @@ from touchgoal.rewards.features.embedded import (
 from touchgoal.rewards.features.embedder import FeatureStream
 from touchgoal.rewards.features.successful_ends import GOAL_FILE
 from touchgoal.rewards.goals import GoalFile, Inputs, parse_goal, same_episode
-from touchgoal.rewards.judge import FIT_JUDGE, JUDGE, Judgement
+from touchgoal.rewards.judging.judge import FIT_JUDGE, JUDGE, Judgement
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.reward import Reward

@@ -8,11 +8,11 @@ from pathlib import Path
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
-from touchgoal.rewards.end_state import end_cost, end_costs
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import Goals
-from touchgoal.rewards.judge import FIT_JUDGE, JUDGE, Judge, Judgement
+from touchgoal.rewards.judging.end_state import end_cost, end_costs
+from touchgoal.rewards.judging.judge import FIT_JUDGE, JUDGE, Judge, Judgement
 from touchgoal.rewards.value import Value
 from touchgoal.runtime.errors import UserError
 

@@ -34,7 +34,7 @@ from touchgoal.rewards.goals import (
     goals_of_script,
     same_episode,
 )
-from touchgoal.rewards.judge import Judgement
+from touchgoal.rewards.judging.judge import Judgement
 from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.sources.episode_trajectories import default_goals
 from touchgoal.rewards.sources.open_source import open_source

@@ -16,7 +16,7 @@ from touchgoal.launch import improve as command
 from touchgoal.policies.training import improve
 from touchgoal.policies.training.improve import Improvement, simulation_of
 from touchgoal.policies.training.training_data import choose_judged
-from touchgoal.rewards.judge import JUDGE, Judge
+from touchgoal.rewards.judging.judge import JUDGE, Judge
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.tasks import make_env
 

@@ -14,10 +14,10 @@ from touchgoal.control.features import FRONT, TACTILE_LEFT, TCP_POSE, WRENCH, WR
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
-from touchgoal.rewards.distance.fit_judge import fit_judge
-from touchgoal.rewards.end_state import end_costs, put_down
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
+from touchgoal.rewards.judging.end_state import end_costs, put_down
+from touchgoal.rewards.judging.fit_judge import fit_judge
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 from touchgoal.rewards.sources.open_source import open_source
 

@@ -35,11 +35,11 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
-from touchgoal.rewards.end_state import end_cost
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
 from touchgoal.rewards.goals import GoalImage, Inputs, Sentence, assign_goals, parse_goal
-from touchgoal.rewards.judge import JUDGE, Judge
+from touchgoal.rewards.judging.end_state import end_cost
+from touchgoal.rewards.judging.judge import JUDGE, Judge
 from touchgoal.rewards.online import CostMeter, OnlineCost, load_cell_cost
 from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.report.plot import plot

@@ -34,10 +34,10 @@ from touchgoal.policies.training.model_selection import copy_parts
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import POLICY, train
 from touchgoal.rewards.distance.normalizer import NORMALIZER, DistanceNormalizer
-from touchgoal.rewards.end_state import end_cost, end_costs
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedding_cache import embed_end
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
+from touchgoal.rewards.judging.end_state import end_cost, end_costs
 from touchgoal.rewards.reward import Reward
 from touchgoal.rewards.sources.open_source import open_source
 from touchgoal.rewards.value import Value

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from benchmarks.options import CORES, BenchmarkOptions
 from benchmarks.papers.judged_hands import LETS_GO, End, record_hands
 from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
-from touchgoal.rewards.judge import Judge
+from touchgoal.rewards.judging.judge import Judge
 from touchgoal.rewards.metrics import auc
 from touchgoal.runtime.option_types import Count, checked_dataclass
 

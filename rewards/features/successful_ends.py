@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
-from touchgoal.rewards.end_state import put_down
 from touchgoal.rewards.features import embedded
+from touchgoal.rewards.judging.end_state import put_down
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from string import Template
 
 from touchgoal.episodes.outcomes.judged import JudgedOutcome
-from touchgoal.rewards.judge import Judgement
+from touchgoal.rewards.judging.judge import Judgement
 from touchgoal.rewards.report.page import data_uri
 from touchgoal.rewards.report.thumbnails import Thumbnails
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory

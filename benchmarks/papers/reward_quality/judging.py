@@ -14,7 +14,6 @@ from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
-from touchgoal.rewards.end_state import end_cost, end_costs
 from touchgoal.rewards.features.embedded import (
     IMAGE,
     TEXT,
@@ -24,6 +23,7 @@ from touchgoal.rewards.features.embedded import (
 )
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.goals import OwnFrame, Sentence
+from touchgoal.rewards.judging.end_state import end_cost, end_costs
 from touchgoal.rewards.value import Value, fit_value
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track

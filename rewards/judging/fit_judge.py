@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 from touchgoal.rewards.distance.fit_normalizer import fit_units
-from touchgoal.rewards.end_state import end_cost, end_costs
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
-from touchgoal.rewards.judge import Judge
+from touchgoal.rewards.judging.end_state import end_cost, end_costs
+from touchgoal.rewards.judging.judge import Judge
 from touchgoal.rewards.value import Value, fit_value
 
 _FOLDS = 4
