@@ -20,7 +20,6 @@ from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
-from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Positive, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.scene.objects import CATALOGUE
@@ -68,7 +67,8 @@ def run(config: Config) -> dict[str, Any]:
     kinds = [kind for kind, count in counts.items() for _ in range(count)]
     with ThreadPoolExecutor(config.workers) as pool:
         done = pool.map(partial(_deploy, config), enumerate(kinds))
-        rows = list(track(done, "deploying", "deployment", total=len(kinds)))
+        deployed = list(track(done, "deploying", "deployment", total=len(kinds)))
+    rows = [row for row in deployed if row.verdict != REFUSED]
     lines = [f"{'truly':<10}{'runs':>5}{'told so [95 % Wilson]':>24}  other verdicts"]
     for success, verdict in ((True, "success"), (False, "failure")):
         if some := [row for row in rows if row.success is success]:
@@ -82,8 +82,9 @@ def run(config: Config) -> dict[str, Any]:
         what = f"{row.run.seed} {row.run.item}, {row.kind}, truly {row.success}"
         lines += [] if right else [f"    {what}: {end}"]
     ended = sum(row.run.ending.startswith("the judge") for row in rows)
-    lines.append(f"ended by the judge: {ended} of {len(rows)}")
-    return {"table": "\n".join(lines), "deployments": [asdict(row) for row in rows]}
+    refused = len(deployed) - len(rows)
+    lines.append(f"ended by the judge: {ended} of {len(rows)}; {refused} could not begin")
+    return {"table": "\n".join(lines), "deployments": [asdict(row) for row in deployed]}
 
 
 def _deploy(config: Config, job: tuple[int, Kind]) -> Judged:
@@ -101,7 +102,7 @@ def _deploy(config: Config, job: tuple[int, Kind]) -> Judged:
             seconds = config.seconds / 4 if kind == "cut short" else config.seconds
             run = deploy(cell, scene, policy, kind, seconds, folder / "run")
             if run.ending.startswith(REFUSED):
-                raise UserError(run.ending)
+                return Judged(kind, REFUSED, [run.ending], False, run)
             success = bool(ask_twin(task["twin"], "truth")["success"])
         judged = json.loads((folder / "run" / "metrics.json").read_text())["judged"]
     told = judged or {"verdict": "not asked", "reasons": []}
