@@ -1,6 +1,6 @@
 """The reward: how far each frame of a trajectory is from a goal, in images, touch and words."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import overload
 
@@ -19,7 +19,7 @@ from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNormalizer, scene_of
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
-from touchgoal.rewards.features.embedding_cache import embed_trajectory
+from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
 from touchgoal.rewards.goals import (
     SIDES,
     GoalLike,
@@ -38,7 +38,7 @@ from touchgoal.rewards.judging.judge import Judgement
 from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.sources.episode_trajectories import default_goals
 from touchgoal.rewards.sources.open_source import open_source
-from touchgoal.rewards.sources.trajectory import Source
+from touchgoal.rewards.sources.trajectory import Source, Trajectory
 from touchgoal.rewards.value import REMEDY as VALUE_REMEDY
 from touchgoal.rewards.value import VALUE_FORMAT, Value
 from touchgoal.runtime.errors import UserError
@@ -172,7 +172,8 @@ class Reward:
         if isinstance(recording, Episode):
             found = self._embed_episode(recording, FRONT, fps, scene_of(recording.frames))
             return found[0].judge_episode(found[1])
-        return [reward.judge_episode(e) for reward, e in self._embed_set(recording, FRONT)]
+        ends = self._embed_set(recording, FRONT, embed_end)
+        return [reward.judge_episode(e) for reward, e in ends]
 
     def prepare(self, inputs: Inputs, goals: Sequence[GoalSpec] = ()) -> PreparedReward:
         """Check the goals against what will be measured, load the encoders, choose the normalizer.
@@ -273,7 +274,10 @@ class Reward:
         return found, value, f"normalizer: {reason}{beside}{without}", folder
 
     def _embed_set(
-        self, recording: EpisodeSet | str | Path, camera: str
+        self,
+        recording: EpisodeSet | str | Path,
+        camera: str,
+        embed: Callable[[EpisodeEmbedder, Trajectory], EmbeddedEpisode] = embed_trajectory,
     ) -> Iterator[tuple[PreparedReward, EmbeddedEpisode]]:
         opened = isinstance(recording, EpisodeSet)
         root, keys = (recording.root, recording.keys) if opened else (Path(recording), None)
@@ -282,7 +286,7 @@ class Reward:
             raise UserError(source.skipped[0].reason)
         prepared = self.prepare_source(source)
         for t in source.trajectories:
-            yield prepared[t.name], embed_trajectory(prepared[t.name].embedder, t)
+            yield prepared[t.name], embed(prepared[t.name].embedder, t)
 
     def _embed_episode(
         self, episode: Episode, camera: str, fps: float, scene: str

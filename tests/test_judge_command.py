@@ -16,10 +16,13 @@ from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
-from touchgoal.rewards.judging.end_state import end_costs, put_down
+from touchgoal.rewards.features.successful_ends import SuccessfulEnds
+from touchgoal.rewards.judging.end_state import end_cost, end_costs, put_down
 from touchgoal.rewards.judging.fit_judge import fit_judge
+from touchgoal.rewards.judging.judge import Judge
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 from touchgoal.rewards.sources.open_source import open_source
+from touchgoal.runtime.errors import UserError
 
 
 def test_no_success_fits_what_measures_it() -> None:
@@ -56,6 +59,8 @@ def test_an_end_is_judged_alike_from_less(embedder: EpisodeEmbedder, tmp_path: P
     goal = {k: whole.features[k][35:36] for k in ("front", "touch", "held", "wrench")}
     expected = end_costs(whole.features, 20, goal, units, None)
     assert expected["object"] > 0.1 and expected["front"] > 0.1
+    ends, of_less = SuccessfulEnds.of([whole]).features, SuccessfulEnds.of([less]).features
+    assert {k: len(v) for k, v in of_less.items()} == dict.fromkeys(ends, 1)
     for one in (less, again):
         assert end_costs(one.features, 20, goal, units, None) == pytest.approx(expected, abs=1e-3)
 
@@ -95,3 +100,54 @@ def test_fitted_judged_and_corrected(
     main([*judge, "again"])
     told = json.loads(Path("set/judged.json").read_text())
     assert [one["verdict"] for one in told.values() if one["by"] == "person"] == ["failure"]
+
+
+def test_the_limits_keep_their_bounds_and_doubt_without_failures(tmp_path: Path) -> None:
+    """Over exchangeable costs at most a tenth of either side is called the other, and hardly less."""
+    rng, trials, wrong = np.random.default_rng(0), 2000, [0, 0]
+    for _ in range(trials):
+        good, bad = rng.gamma(2.0, 0.1, 31), 0.2 + rng.gamma(2.0, 0.1, 31)
+        judge = Judge(tuple(good[1:].tolist()), tuple(bad[1:].tolist()))
+        accept, refuse = judge.limits
+        if accept < refuse:  # else one limit lies between both
+            wrong[0] += judge.verdict(float(good[0])) == "failure"
+            wrong[1] += judge.verdict(float(bad[0])) == "success"
+    assert 0.05 * trials < min(wrong) and max(wrong) < 0.12 * trials
+    without = Judge(tuple(np.linspace(0.1, 0.9, 9)))
+    assert without.verdict(0.8) == "unsure" and "unknown: show it 20" in str(without)
+    without.corrected(0.95, success=False).save(tmp_path / "judge.json")
+    assert Judge.load(tmp_path / "judge.json").failures == (0.95,)
+    with pytest.raises(UserError, match="at least 9 successes"):
+        Judge((0.1,) * 8)
+    (tmp_path / "judge.json").write_text("[]")
+    with pytest.raises(UserError, match="is no judge: fit one"):
+        Judge.load(tmp_path / "judge.json")
+
+
+def test_pressing_and_a_missing_put_down_cost() -> None:
+    """Pressing counts above 5 N and above what successes do, one-sidedly; nothing put down counts in full."""
+    felt = {"wrench": np.zeros((12, 6), np.float32), "held": np.ones((12, 1), bool)}
+    goal = {"wrench": felt["wrench"][:2], "held": felt["held"][:2], "put_down": np.ones(2, bool)}
+    costs = {}
+    for newtons in (0, 4, 9, 40):
+        felt["wrench"][:, 2] = newtons
+        costs[newtons] = end_costs(felt, 20, goal, {"held": 0.3}, None)
+    assert costs[0]["put_down"] == 1
+    assert (
+        costs[0]["press"] == costs[4]["press"] == 0 < costs[9]["press"] < 0.3 < costs[40]["press"]
+    )
+
+
+def test_the_scene_is_compared_cell_by_cell_with_any_success() -> None:
+    """Every cell is known from one success or another: no cost; one unknown cell of twenty: its cost."""
+    rng = np.random.default_rng(0)
+    known = rng.normal(size=(2, 8, 4, 5)).astype(np.float16)
+    mixed = known[:1].copy()
+    mixed[0, :, 2:] = known[1, :, 2:]
+    goal = {"wrist": np.ones((1, 4), np.float32) / 2, "wrist_map": known[:1], "scene_map": known}
+    seen = {"wrist": goal["wrist"], "wrist_map": mixed}
+    assert end_costs(seen, 20, goal, {"wrist": 0.1}, None)["scene"] == pytest.approx(0, abs=1e-5)
+    mixed[0, :, 1, 1] *= -1
+    cost = end_costs(seen, 20, goal, {"wrist": 0.1}, None)
+    assert cost["scene"] > 0.5 and cost["wrist"] == pytest.approx(0, abs=1e-6)
+    assert end_cost(cost) == pytest.approx(np.sqrt(0.4) * cost["scene"])

@@ -133,7 +133,7 @@ def _embed(recorded: Sequence[Recorded], workers: int) -> list[EmbeddedEpisode]:
 def _embed_one(recorded: Recorded) -> EmbeddedEpisode:
     torch.set_num_threads(1)
     source = open_source(recorded.root, FRONT, [recorded.index])
-    embedded = embed_end(_reward().embedder(source.inputs), source.trajectories[0])  # pyright: ignore[reportArgumentType]
+    embedded = embed_end(_reward().embedder(source.inputs), source.trajectories[0])
     return replace(embedded, object=recorded.object)
 
 

@@ -111,7 +111,7 @@ def join_rows(pieces: Sequence[Features]) -> Features:
 
 def last_rows(episodes: Iterable[EmbeddedEpisode]) -> Features:
     """Return the features of the last frame of each of some episodes that were embedded alike."""
-    return join_rows([take_rows(e.features, slice(len(e) - 1, None)) for e in episodes])
+    return join_rows([take_rows(e.features, slice(-1, None)) for e in episodes])
 
 
 def split_features(features: Features) -> tuple[Features, Features]:

@@ -47,12 +47,15 @@ def embed_trajectory(
     return _keep(path, embedder.embed_chunks(chunks, *about))
 
 
-def embed_end(embedder: EpisodeEmbedder, trajectory: EpisodeTrajectory) -> EmbeddedEpisode:
+def embed_end(embedder: EpisodeEmbedder, trajectory: Trajectory) -> EmbeddedEpisode:
     """Return what `end_costs` reads of an episode, from a file if there is one.
 
     That is contact and arm at all frames, cameras at the last one, and the touch embedding at two: the
-    last one, and the one before `put_down`, which stands for all frames until then.
+    last one, and the one before `put_down`, which stands for all frames until then. A video is embedded
+    whole.
     """
+    if not isinstance(trajectory, EpisodeTrajectory):
+        return embed_trajectory(embedder, trajectory)
     for path in (kept_file(embedder, trajectory), kept_file(embedder, trajectory, "end")):
         if path is not None and path.is_file():
             return _load(path, trajectory)

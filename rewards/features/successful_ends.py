@@ -30,7 +30,7 @@ class SuccessfulEnds:
     def of(cls, episodes: Sequence[embedded.EmbeddedEpisode]) -> "SuccessfulEnds":
         """Take the end of each of some episodes that were embedded alike, whole or only their ends."""
         ends = dict(embedded.last_rows(episodes))
-        if len(episodes[0]) > START_FRAMES + 1:
+        if len(episodes[0].features.get("held", ())) > START_FRAMES + 1:
             down = [put_down(e.features, e.fps) is not None for e in episodes]
             ends[embedded.PUT_DOWN] = np.array(down)
         return cls(ends, tuple(e.object for e in episodes), episodes[0].made_with)
