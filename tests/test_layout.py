@@ -19,7 +19,7 @@ from touchgoal.launch.__main__ import COMMANDS
 # in a change that says so.
 WHEEL_LINES = 51_000  # of Python
 REPOSITORY_LINES = 63_370  # of Python, outside tests/
-TEST_LINES = 19_060  # of Python
+TEST_LINES = 19_120  # of Python
 PAGE_WORDS = 12_000  # README, CHANGELOG and docs/*.md
 COMMANDS_IN_ALL = 34  # sub-commands included
 OPTIONS_IN_ALL = 405  # of all commands, each with its own

@@ -150,7 +150,7 @@ def test_before_contact_the_fingertips_cost_the_same_whatever_they_read(
     parts = compute_curves(embedded(9), goal, normalizer).parts
     for name in ("object", "force", "centre", "held"):
         assert parts[name][:GRASP] == pytest.approx(np.ones(GRASP)), name
-    assert np.ptp(parts["fused"][:GRASP]) > 0.005  # the images lead
+    assert np.ptp(parts["fused"][:GRASP]) > 0.01  # the images lead
     costs, touching = np.array([0.2, 0.3]), np.array([False, True])
     assert gate(costs, touching, goal_touches=False) == pytest.approx([0, 0.3])
 

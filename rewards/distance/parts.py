@@ -8,8 +8,7 @@ is detected, with hysteresis (`ContactReader`): before contact only the other pa
 fused cost.
 
     front, wrist  pooled features of the camera of that name
-    wrist_map     feature map of the wrist camera at stride 16, where it differs most: where objects are in
-                  the hand's frame
+    wrist_map     feature map of the wrist camera at stride 16: where objects are in the hand's frame
     object        touch embedding: which object is held
     centre        where on the fingertips the object is held
     held          whether the fingertips touch
@@ -55,7 +54,6 @@ SPREAD_QUANTILE = 0.9  # of distances between ends that all succeeded: their spr
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
 _SOFTNESS = 8.0  # exponent of the soft minimum
 _WRIST_MAP = "wrist_map"
-_WORST_CELLS = 0.1  # share of a map's positions that count
 _CHUNK = 256  # frames of maps in float64 at once
 SMOOTHING = 0.1  # time constant of the causal smoothing, s
 
@@ -63,7 +61,7 @@ SMOOTHING = 0.1  # time constant of the causal smoothing, s
 def part_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndarray, "n g"]]:
     """Return the distance of each frame to each goal, for the parts that both have.
 
-    Images: cosine distance, of maps its mean over the tenth of the positions where it is largest. Object: half the squared
+    Images: cosine distance, at stride 16 its mean over positions. Object: half the squared
     distance of embeddings. Force: N, of the mean over the fingertips. Centre: m. Held: 0 or 1.
     Slip: m, whatever the goal. These are means over the fingertips. Wrench: N.
     """
@@ -94,16 +92,13 @@ def cosine_distances(
 def map_distances(
     mine: Float16[np.ndarray, "n c y x"], goals: Float16[np.ndarray, "g c y x"]
 ) -> Float[np.ndarray, "n g"]:
-    """Return 1 - cos of two maps, mean over the tenth of the positions where it is largest.
-
-    What is out of place fills a few cells, which a mean over all of them hides.
-    """
-    theirs, n = unit_map(goals), max(1, round(_WORST_CELLS * goals.shape[2] * goals.shape[3]))
+    """Return 1 - cos at each position of two maps, mean over the positions."""
+    theirs, positions = unit_map(goals), goals.shape[2] * goals.shape[3]
     chunks = [
-        np.einsum("ncp,gcp->ngp", unit_map(mine[i : i + _CHUNK]), theirs, optimize=True)
+        np.tensordot(unit_map(mine[i : i + _CHUNK]), theirs, ((1, 2), (1, 2)))
         for i in range(0, len(mine), _CHUNK)
     ]
-    return 1 - np.partition(np.concatenate(chunks), n - 1)[..., :n].mean(-1)
+    return 1 - np.concatenate(chunks) / positions
 
 
 def object_distances(
