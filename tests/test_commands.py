@@ -231,7 +231,7 @@ def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     result = json.loads((tmp_path / "metrics.json").read_text())["scenes"]["fixed"]
     assert set(result["auc"]) == {*kinds, "mean of true kinds"}
     assert result["episodes"] == dict.fromkeys(outcomes, 1) | {"success": 2}
-    assert result["success"]["demonstrations"] == 9 and len(result["claims"]) >= 4
+    assert len(result["claims"]) >= 4
 
 
 @pytest.mark.slow

@@ -229,6 +229,8 @@ class SlowToWarmUp:
         self.log.append("read")
         return CostReading(0.5, self.clock.now())
 
+    judge = read
+
 
 def test_a_cost_warms_up_before_the_first_tick() -> None:
     cell = FakeCell()

@@ -127,7 +127,11 @@ def test_the_limits_keep_their_bounds_and_doubt_without_failures(tmp_path: Path)
 def test_pressing_and_a_missing_put_down_cost() -> None:
     """Pressing counts above 5 N and above what successes do, one-sidedly; nothing put down counts in full."""
     felt = {"wrench": np.zeros((12, 6), np.float32), "held": np.ones((12, 1), bool)}
-    goal = {"wrench": felt["wrench"][:2].copy(), "held": felt["held"][:2], "put_down": np.ones(2, bool)}
+    goal = {
+        "wrench": felt["wrench"][:2].copy(),
+        "held": felt["held"][:2],
+        "put_down": np.ones(2, bool),
+    }
     costs = {}
     for newtons in (0, 4, 9, 40):
         felt["wrench"][:, 2] = newtons

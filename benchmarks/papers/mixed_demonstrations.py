@@ -126,10 +126,10 @@ def record_mixed(
     count: int,
     env: PickPlaceConfig,
     workers: Workers,
-    objects: Sequence[str] = HELD_OUT_OBJECTS,
+    objects: Sequence[str] | None = None,  # default: those held out
 ) -> list[Recorded]:
     """Record `count` demonstrations, right and wrong; return them with what came of each."""
-    first = _FIRST_SEED if objects == HELD_OUT_OBJECTS else _FIRST_SEED + 60_000
+    first = _FIRST_SEED if objects is None else _FIRST_SEED + 60_000
     moved = replace(env, disturbance=_DISTURBANCE)
     return _record(folder, count, first, MixedRoles(), moved, workers, objects)
 
@@ -155,8 +155,9 @@ def _record(
     roles: Roles,
     env: PickPlaceConfig,
     workers: Workers,
-    objects: Sequence[str] = HELD_OUT_OBJECTS,
+    objects: Sequence[str] | None = None,  # default: those held out
 ) -> list[Recorded]:
+    objects = objects or HELD_OUT_OBJECTS
     specs = [
         EpisodeSpec(seed + k, options={"object": objects[(k + k // 20) % len(objects)]})
         for k in range(count)

@@ -12,17 +12,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
+from touchgoal.episodes.outcomes.judged import Verdict
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
 FIT_JUDGE = "fit one with touchgoal fit-normalizer --judge"
 JUDGE = "judge.json"
 """Name of the file, beside the normalizer."""
-Verdict = Literal["success", "failure", "unsure"]
 WRONG = 0.1  # bound on the share of successes called failures, and of failures called successes
 _DOUBTED = 0.4  # share of successes that are not called so where failures are missing
 LEAST_SUCCESSES, LEAST_FAILURES = 9, 20
