@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from benchmarks.options import CORES, BenchmarkOptions
 from benchmarks.papers.judged_hands import LETS_GO, End, record_hands
 from benchmarks.papers.reward_objects import HELD_OUT_OBJECTS
-from touchgoal.rewards.judging.judge import Judge
+from touchgoal.rewards.judging.judge import LEAST_SUCCESSES, Judge
 from touchgoal.rewards.metrics import auc
 from touchgoal.runtime.option_types import Count, checked_dataclass
 
@@ -98,6 +98,7 @@ def judge_hands(hands: dict[str, list[End]], others: Sequence[End]) -> dict[str,
         f"{judged}, fitted on {fitted}": _rates(costs[fitted], costs[judged], failures)
         for fitted, judged in pairs
     }
+    rates = {name: row for name, row in rates.items() if row}
     kinds = {
         f"{name}: {kind}": value for name, c in costs.items() for kind, value in _aucs(c).items()
     }
@@ -111,6 +112,8 @@ def _rates(fitted: _Costs, judged: _Costs, failures: Sequence[float]) -> dict[st
     for _ in range(_DRAWS):
         half = {str(o) for o in rng.permutation(HELD_OUT_OBJECTS)[:5]}
         known = fitted.split(half)[0]
+        if len(known) < LEAST_SUCCESSES:  # a hand that seldom succeeds
+            continue
         known = rng.permutation(known)[:_FITTED]
         good, bad = judged.split(set(HELD_OUT_OBJECTS) - half)
         limit = float(np.quantile(known, _RECALL, method="higher"))
@@ -127,6 +130,8 @@ def _rates(fitted: _Costs, judged: _Costs, failures: Sequence[float]) -> dict[st
                 "failure right": 1 - _precision(*told["failure"]),
             }
         )
+    if not rows:
+        return {}
     found = {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
     return {"precision": _precision(found["recall"], found["false"])} | found
 
