@@ -107,9 +107,7 @@ def run(
     info: dict[str, Any],
     expert: Actor | None = None,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Act until the episode ends, then rest as long as the environment's config says.
-
-    Yields each tick's observation, action and ground truth.
+    """Act until the episode ends, then rest as the config says; yield each tick with action and truth.
 
     The environment was just reset. An expert's actions, if given, are recorded in place of the
     actor's.

@@ -85,15 +85,9 @@ class Judge:
 
     def judge(self, parts: Mapping[str, float], cost: float) -> Judgement:
         """Return the judgement of an end."""
-        worst = sorted(parts, key=lambda name: -parts[name])
-        return Judgement(
-            self.verdict(cost),
-            cost,
-            parts,
-            tuple(
-                _SAYS.get(n, _SAYS["wrist"].replace("wrist", n)) for n in worst if parts[n] > _FAR
-            ),
-        )
+        far = sorted((n for n in parts if parts[n] > _FAR), key=lambda name: -parts[name])
+        reasons = tuple(_SAYS.get(n, _SAYS["wrist"].replace("wrist", n)) for n in far)
+        return Judgement(self.verdict(cost), cost, parts, reasons)
 
     def corrected(self, cost: float, success: bool) -> "Judge":
         """Return the judge with one more known end."""
