@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,13 @@ from touchgoal.control.features import FRONT, Observation
 from touchgoal.control.interfaces import Actor
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.episodes.recording import EpisodeSpec, collect, missing_specs
+from touchgoal.episodes.recording import collect, missing_specs
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.evaluation.evaluate import trial_specs
+from touchgoal.policies.training.improve import Acting
 from touchgoal.policies.training.model_selection import copy_parts
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import POLICY, train
@@ -157,15 +158,9 @@ class _Unsure(Actor):
         return action
 
 
-@dataclass(frozen=True)
-class _Acts:
-    """The policy in a folder, as `collect` asks for it."""
-
-    folder: Path
-
-    def __call__(self, env: Any, spec: EpisodeSpec) -> tuple[Actor, Actor]:
-        actor = _Unsure(SavedPolicy(self.folder)(env), env.n_joints, env.width())
-        return actor, actor
+def _act(policy: Path, env: Any) -> Actor:
+    """Return the policy in a folder for an environment after its reset."""
+    return _Unsure(SavedPolicy(policy)(env), env.n_joints, env.width())
 
 
 def _policy_runs(
@@ -188,7 +183,7 @@ def _policy_runs(
     env = replace(_ENV, objects=HELD_OUT_OBJECTS, camera_size=size)
     specs, root = trial_specs(env, count, _POLICY_SEED), folder / "episodes"
     if missing := missing_specs(root, specs):
-        collect(root, env, missing, workers, _Acts(policy))
+        collect(root, env, missing, workers, Acting(partial(_act, policy)))
     return list(_as_recorded(root))
 
 
