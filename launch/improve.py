@@ -28,8 +28,8 @@ class Config:
     """Episode set of demonstrations; it is copied, and the runs are recorded beside them."""
     validation: Path
     """Episode set for the validation loss, as for train-policy."""
-    judge: Path
-    """Folder of a judge: goal.npz, normalizer.json and judge.json of fit-normalizer --judge."""
+    judge: str = "gelsight_mini"
+    """Folder of fit-normalizer --judge, or the name of an encoder that ships with a judge."""
     rounds: Count = 3
     """Rounds of runs, labels and a training."""
     episodes: Count = 50
@@ -50,12 +50,12 @@ def main(config: Config) -> None:
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.policies.checkpoint import find_policy
     from touchgoal.policies.training import improve
-    from touchgoal.rewards.judging.judge import JUDGE, Judge
+    from touchgoal.rewards.judging.judge import find_judge
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.run_folder import open_run
 
-    Judge.load(config.judge / JUDGE)  # the options, too, are checked before work
-    read_training(config.validation, config.train, config.data, config.judge / "unused")
+    find_judge(config.judge)  # the options, too, are checked before work
+    read_training(config.validation, config.train, config.data, Path("unused"))
     policy = find_policy(config.policy) if config.policy else None
     env = improve.simulation_of(EpisodeSet(config.data))
     record = partial(improve.record_simulated, env, config.workers) if env else _ask_for_runs
@@ -75,15 +75,12 @@ def main(config: Config) -> None:
     print(f"next: touchgoal {'run-policy' if env else 'deploy CELL'} --policy {last}")
 
 
-def judge_set(folder: Path, episodes: "EpisodeSet") -> "dict[int, JudgedOutcome]":
-    """Return what the judge in a folder says of each episode."""
+def judge_set(judge: str, episodes: "EpisodeSet") -> "dict[int, JudgedOutcome]":
+    """Return what a judge, see `Reward.of_judge`, says of each episode."""
     from touchgoal.episodes.outcomes.judged import JudgedOutcome
-    from touchgoal.rewards.distance.normalizer import NORMALIZER
-    from touchgoal.rewards.features.successful_ends import GOAL_FILE
     from touchgoal.rewards.reward import Reward
 
-    reward = Reward(f"goal:{folder / GOAL_FILE}", normalizer=folder / NORMALIZER)
-    found = enumerate(reward.judge(episodes))
+    found = enumerate(Reward.of_judge(judge).judge(episodes))
     return {i: JudgedOutcome(j.verdict, "judge", j.cost, j.reasons) for i, j in found}
 
 

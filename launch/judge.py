@@ -31,8 +31,9 @@ class Config:
 
     source: Annotated[Path, tyro.conf.Positional]
     """A set of episodes."""
-    judge: Path
-    """Folder of fit-normalizer --judge."""
+    judge: str = "gelsight_mini"
+    """Folder of fit-normalizer --judge, or the name of an encoder that ships with a judge: the default's
+    is of simulated pick-and-place."""
     correct: bool = False
     """Then ask a person about each episode, doubtful ones first; answers also go into the judge."""
     keys: Annotated[tuple[str, ...], RARE] = ()
@@ -48,11 +49,8 @@ def main(config: Config) -> None:
     """Check, judge, write the verdicts, and ask if wanted."""
     from touchgoal.episodes.keys import parse_keys
     from touchgoal.episodes.outcomes.judged import JudgedOutcome, read_judged, write_judged
-    from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.features.embedding_cache import embed_end
-    from touchgoal.rewards.features.successful_ends import GOAL_FILE
-    from touchgoal.rewards.goals import GoalFile
-    from touchgoal.rewards.judging.judge import JUDGE, Judgement
+    from touchgoal.rewards.judging.judge import JUDGE, Judgement, find_judge
     from touchgoal.rewards.measure import write_skipped
     from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
@@ -63,12 +61,16 @@ def main(config: Config) -> None:
 
     if config.correct and (sys.stdin is None or not sys.stdin.isatty()):
         raise UserError("--correct asks a person: run it in a terminal")
+    folder = find_judge(config.judge)
+    if config.correct and not Path(config.judge).is_dir():
+        raise UserError(
+            f"--correct teaches the judge, and {folder} came with touchgoal: copy it first"
+        )
     source = open_source(config.source, "front", keys=parse_keys(config.keys))
     trajectories = [t for t in source.trajectories if isinstance(t, EpisodeTrajectory)]
     if not trajectories:
         raise UserError(f"{config.source} is no set of episodes: give one")
-    goal, units = GoalFile(config.judge / GOAL_FILE), config.judge / NORMALIZER
-    prepared = Reward(goal, encoder=config.encoder, normalizer=units).prepare(source.inputs)
+    prepared = Reward.of_judge(config.judge, config.encoder).prepare(source.inputs)
     judge, episodes = prepared.judge, trajectories[0].episodes
     told = {i: one for i, one in read_judged(episodes).items() if one.by == "person"}
     out = open_run(config.out, "judge", config)
@@ -87,7 +89,7 @@ def main(config: Config) -> None:
         told[i] = JudgedOutcome(verdict, "person", end.said.cost)
         write_judged(episodes, {i: told[i]})
         judge = judge.corrected(end.said.cost, success)
-        judge.save(config.judge / JUDGE)
+        judge.save(folder / JUDGE)
     if judge is not prepared.judge:
         _report(said, told, judge, out)
 

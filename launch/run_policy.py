@@ -36,9 +36,9 @@ class Config:
     """Processes that simulate."""
     ray: str | None = None
     """Address of a Ray cluster whose cores work in place of --workers; auto: one started on this machine."""
-    judge: Path | None = None
-    """Folder of fit-normalizer --judge: its judge ends episodes and judges them beside the simulator, after
-    a second of rest."""
+    judge: str | None = None
+    """Folder of fit-normalizer --judge, or gelsight_mini for the one that ships: its judge ends episodes
+    and judges them beside the simulator, after a second of rest."""
     video: bool = True
     """Film the worst, the median and the best episode."""
     rerun: str | None = None

@@ -4,7 +4,6 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from threading import Lock
 
 import numpy as np
@@ -16,7 +15,7 @@ from touchgoal.control.interfaces import CostReading
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.rewards.curves import FUSED
 from touchgoal.rewards.distance.cost import compute_curves
-from touchgoal.rewards.distance.normalizer import NORMALIZER, REAL_SCENE
+from touchgoal.rewards.distance.normalizer import REAL_SCENE
 from touchgoal.rewards.features.embedded import (
     EmbeddedEpisode,
     EmbeddedGoal,
@@ -25,9 +24,8 @@ from touchgoal.rewards.features.embedded import (
     split_features,
 )
 from touchgoal.rewards.features.embedder import FeatureStream
-from touchgoal.rewards.features.successful_ends import GOAL_FILE
-from touchgoal.rewards.goals import GoalFile, Inputs, parse_goal, same_episode
-from touchgoal.rewards.judging.judge import FIT_JUDGE, JUDGE, Judgement
+from touchgoal.rewards.goals import Inputs, parse_goal, same_episode
+from touchgoal.rewards.judging.judge import Judgement
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.reward import Reward
@@ -277,9 +275,9 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
         cameras=cameras,
         task=cell.task.instruction or cell.task.name,
     )
-    task, folder = cell.task, Path(cell.task.judge)
+    task = cell.task
     if task.judge:
-        reward = judged_reward(folder, task.encoder or None)
+        reward = Reward.of_judge(task.judge, task.encoder or None)
     else:
         reward = Reward(
             [parse_goal(text) for text in task.rewards],
@@ -289,13 +287,3 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
     item = task.objects[0] if len(task.objects) == 1 else ""
     meter = CostMeter(reward.prepare(inputs), item, judges=bool(task.judge))
     return OnlineCost(meter, task.give_up, cell.time_waits)
-
-
-def judged_reward(folder: Path, encoder: str | None = None) -> Reward:
-    """Return the reward whose goals, normalizer, value and judge lie in a folder of `fit-normalizer --judge`.
-
-    UserError: they do not.
-    """
-    if not (folder / JUDGE).is_file():
-        raise UserError(f"there is no {folder / JUDGE}: {FIT_JUDGE}")
-    return Reward(GoalFile(folder / GOAL_FILE), encoder=encoder, normalizer=folder / NORMALIZER)

@@ -20,8 +20,10 @@ from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNo
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
+from touchgoal.rewards.features.successful_ends import GOAL_FILE
 from touchgoal.rewards.goals import (
     SIDES,
+    GoalFile,
     GoalLike,
     Goals,
     GoalSpec,
@@ -34,7 +36,7 @@ from touchgoal.rewards.goals import (
     goals_of_script,
     same_episode,
 )
-from touchgoal.rewards.judging.judge import Judgement
+from touchgoal.rewards.judging.judge import Judgement, find_judge
 from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.sources.episode_trajectories import default_goals
 from touchgoal.rewards.sources.open_source import open_source
@@ -113,6 +115,15 @@ class Reward:
         self._encoders: dict[str | None, tuple[AnyTouchEncoder, Path | None]] = {}  # by sensor
         self._loaded_towers: dict[str, Towers] = {}  # by name
         self._embedders: dict[tuple[str | None, ...], EpisodeEmbedder] = {}
+
+    @classmethod
+    def of_judge(cls, judge: str | Path, encoder: str | None = None) -> "Reward":
+        """Return the reward with the goals, units, value and judge of `fit-normalizer --judge`.
+
+        `judge` is its folder, or the name of an encoder that ships with one; UserError: it has none.
+        """
+        folder = find_judge(judge)
+        return cls(GoalFile(folder / GOAL_FILE), encoder=encoder, normalizer=folder / NORMALIZER)
 
     @overload
     def __call__(

@@ -10,7 +10,7 @@ import numpy as np
 from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE, Observation
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.online import CostMeter, judged_reward
+from touchgoal.rewards.online import CostMeter
 from touchgoal.rewards.reward import Reward
 
 
@@ -79,12 +79,12 @@ class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray
 class RunJudge:
     """Judge of one episode of an environment, as `deploy` asks it: once a second, and at the end."""
 
-    def __init__(self, folder: Path, env: gym.Env) -> None:
-        """Take the folder of `fit-normalizer --judge`, and an environment of touchgoal after its reset.
+    def __init__(self, judge: str | Path, env: gym.Env) -> None:
+        """Take a judge, see `Reward.of_judge`, and an environment of touchgoal after its reset.
 
         UserError: no judge lies there, or it cannot judge such observations.
         """
-        reward = _judged_reward(folder).prepare(inputs_of(env))
+        reward = _judged_reward(judge).prepare(inputs_of(env))
         about, self._rate = env.unwrapped.episode_info(), env.unwrapped.config.control_hz  # pyright: ignore[reportAttributeAccessIssue]
         self._meter = CostMeter(reward, str(about.get("object", "")), self._rate, judges=True)
         self._first: tuple[Observation, ...] = ()
@@ -111,4 +111,4 @@ class RunJudge:
         self._waiting = []
 
 
-_judged_reward = cache(judged_reward)  # encoders are loaded once a process
+_judged_reward = cache(Reward.of_judge)  # encoders are loaded once a process

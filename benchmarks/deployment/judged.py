@@ -19,6 +19,7 @@ from benchmarks.deployment.deployed_episode import REFUSED, Deployment, Scene, d
 from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.rewards.judging.judge import SHIPPED_JUDGE, find_judge
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Positive, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
@@ -32,8 +33,8 @@ _BESIDE = 0.04, 0.08  # m from the goal, or from the grasp
 class Config(BenchmarkOptions):
     """Options of benchmark deploy-judged."""
 
-    judge: Path = Path("runs/judge")
-    """Folder of fit-normalizer --judge."""
+    judge: str = SHIPPED_JUDGE
+    """Judge, named as for touchgoal judge."""
     policy: str = "shipped"
     """Policy, named as for deploy."""
     objects: tuple[str, ...] = tuple(CATALOGUE)
@@ -96,7 +97,10 @@ def _deploy(config: Config, job: tuple[int, Kind]) -> Judged:
         with deployed_twin(scene, True, folder, number) as cell:
             table = json.loads(cell.read_text())
             task, layout = table["task"], ask_twin(table["task"]["twin"], "truth")["layout"]
-            task |= {"judge": str(config.judge.resolve()), **_changes(kind, layout, scene.seed)}
+            task |= {
+                "judge": str(find_judge(config.judge).resolve()),
+                **_changes(kind, layout, scene.seed),
+            }
             cell.write_text(json.dumps(table))
             policy = "expert" if kind in ("beside", "missed") else config.policy
             seconds = config.seconds / 4 if kind == "cut short" else config.seconds

@@ -30,8 +30,8 @@ from touchgoal.policies.training.improve import (
     simulation_of,
     true_outcomes,
 )
+from touchgoal.rewards.judging.judge import SHIPPED_JUDGE
 from touchgoal.runtime import seeds
-from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig
 
@@ -43,8 +43,8 @@ _DEMONSTRATED = PickPlaceConfig(objects=("wooden_block",), rest=1.0, disturbance
 class Config(BenchmarkOptions):
     """Options of benchmark improve."""
 
-    judge: Path | None = None
-    """Folder of the judge, for filter judge; fitted on other objects or other episodes than these."""
+    judge: str = SHIPPED_JUDGE
+    """Judge of filter judge, named as for touchgoal judge; fitted on other episodes than these."""
     filters: tuple[Filter, ...] = get_args(Filter)
     """What accepts runs: a judge, the simulator's truth, or nothing (all are accepted)."""
     demonstrations: Count = 15
@@ -63,8 +63,6 @@ class Config(BenchmarkOptions):
 
 def run(config: Config) -> dict[str, Any]:
     """Record, improve by each filter, try the policies."""
-    if "judge" in config.filters and config.judge is None:
-        raise UserError("filter judge needs --judge; without one: --filters truth none")
     if config.out is not None:
         return _run(config, config.out)
     with TemporaryDirectory() as folder:

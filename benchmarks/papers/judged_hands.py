@@ -97,10 +97,10 @@ def _other_failures(
     folder: Path, other: Sequence[Recorded], failures: int, workers: int
 ) -> list[End]:
     """Return ends of failures with the training objects, of the scripted and of the feedback expert."""
-    first = {kind: _OTHER_FAILURES + 1000 * i for i, kind in enumerate(KINDS)}
+    count = max(1, failures // 2)
     wanted = [
-        EpisodeBatch("test", k, max(1, failures // 2), TRAINING_OBJECTS, s)
-        for k, s in first.items()
+        EpisodeBatch("test", kind, count, TRAINING_OBJECTS, _OTHER_FAILURES + 1000 * i)
+        for i, kind in enumerate(KINDS)
     ]
     goal = EpisodeBatch("goal", "success", 20, TRAINING_OBJECTS, seeds.REWARD_TRAINING.start)
     scripted = record(folder / "other-scripted", "elsewhere", [goal, *wanted], _ENV, workers)

@@ -34,7 +34,8 @@ hand closes 5 to 8 cm above the object; it lets go on the way; it stops somewher
 _RIGHT: tuple[Mistake, ...] = ("none",)
 _MISTAKES: tuple[Mistake, ...] = ("beside", "above", "drop", "freeze")
 _TWENTY: tuple[Mistake, ...] = (*_RIGHT * 8, *_MISTAKES * 3)  # eight of twenty are right
-_LED_TWENTY: tuple[Mistake, ...] = (*_RIGHT * 8, *("beside", "off", "above", "off") * 3)
+_LED_MISTAKES: tuple[Mistake, ...] = ("beside", "off", "above", "off")
+_LED_TWENTY: tuple[Mistake, ...] = (*_RIGHT * 8, *_LED_MISTAKES * 3)
 _LED_SECONDS = 30.0  # s that a led hand has
 _DISTURBANCE = 0.01  # m/s, so that corrections are shown
 _CARRIED = (0.5, 1.5)  # s between grasp and letting go

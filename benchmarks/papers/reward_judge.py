@@ -115,7 +115,7 @@ def _rates(fitted: _Costs, judged: _Costs, failures: Sequence[float]) -> dict[st
         if len(known) < LEAST_SUCCESSES:  # a hand that seldom succeeds
             continue
         known = rng.permutation(known)[:_FITTED]
-        good, bad = judged.split(set(HELD_OUT_OBJECTS) - half)
+        good, bad = judged.split(set[str](HELD_OUT_OBJECTS) - half)
         limit = float(np.quantile(known, _RECALL, method="higher"))
         labelled = rng.permutation(np.array(failures))[:_FITTED]
         judge = Judge(tuple(known.tolist()), tuple(labelled.tolist()))

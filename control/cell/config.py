@@ -178,8 +178,9 @@ class TaskSection:
     """Normaliser of that distance: a normalizer.json that fit-normalizer made from successes in this cell.
     Default: the encoder's own on a simulated arm or a twin, the raw distance elsewhere."""
     judge: str = ""
-    """Folder of fit-normalizer --judge, in place of `rewards` and `normalizer`: its judge ends the run, and
-    says at its end whether the task is done, in place of a simulator."""
+    """Folder of fit-normalizer --judge, or gelsight_mini for the one that ships, in place of `rewards` and
+    `normalizer`: its judge ends the run, and says at its end whether the task is done, in place of a
+    simulator."""
     give_up: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     """Rise of that distance above its lowest value that ends the run as failed, if it lasts a second; 0:
     never."""

@@ -142,7 +142,8 @@ class Acting:
 
     def __call__(self, env: Any, spec: EpisodeSpec) -> tuple[Actor, Actor]:
         """Return the policy in both roles."""
-        return (self.make(env),) * 2
+        actor = self.make(env)
+        return actor, actor
 
 
 def record_simulated(

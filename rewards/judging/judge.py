@@ -15,11 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
+from touchgoal.encoders.pretrained import DEFAULT_ENCODER
 from touchgoal.episodes.outcomes.judged import Verdict
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
 FIT_JUDGE = "fit one with touchgoal fit-normalizer --judge"
+SHIPPED_JUDGE = DEFAULT_ENCODER.name
+"""Name of the judge that ships, of simulated pick-and-place."""
 JUDGE = "judge.json"
 """Name of the file, beside the normalizer."""
 WRONG = 0.1  # bound on the share of successes called failures, and of failures called successes
@@ -122,6 +125,17 @@ class Judge:
             )
         except (OSError, ValueError, TypeError, AttributeError):
             raise UserError(f"{path} is no judge: {FIT_JUDGE}") from None
+
+
+def find_judge(name: str | Path) -> Path:
+    """Return the folder of a judge, given itself or as the name of an encoder that ships with one.
+
+    UserError: it has none.
+    """
+    for folder in (Path(name), DEFAULT_ENCODER.parent / name):
+        if (folder / JUDGE).is_file():
+            return folder
+    raise UserError(f"there is no {Path(name) / JUDGE}: {FIT_JUDGE}, or give {SHIPPED_JUDGE}")
 
 
 def _quantile(costs: Sequence[float], beyond: float) -> float:
