@@ -89,18 +89,24 @@ images: $(READY)
 		$(BIN)/python docs/images.py runs/images
 
 # How the shipped touch encoder was made: about 45 minutes on 2 cores. Words come from the wand's objects and
-# from those of pick-and-place; the normalizer and the value of rewards from successes with ten of them.
+# from those of pick-and-place; normalizer, value and judge of rewards from runs of two experts with ten of them.
 REWARD_OBJECTS := glass_ball yarn_ball wooden_block cushion soda_can rope_coil candle corn_cob pebble rag_bundle
+REWARD_SETS := successes feedback failures
+REWARD_RUNS := collect-demos --env.objects $(REWARD_OBJECTS)
 weights: $(READY)
 	$(BIN)/touchgoal collect-touches --out runs/wand
 	$(BIN)/touchgoal collect-demos --env.cameras --episodes 160 --seed 0 --out runs/weights/grasps
-	$(BIN)/touchgoal collect-demos --env.objects $(REWARD_OBJECTS) --episodes 40 --seed 3900000 --out runs/weights/successes
+	$(BIN)/touchgoal $(REWARD_RUNS) --episodes 40 --seed 3900000 --out runs/weights/successes
+	$(BIN)/touchgoal $(REWARD_RUNS) --feedback --env.disturbance 0.01 --episodes 40 --seed 3910000 --out runs/weights/feedback
+	$(BIN)/touchgoal $(REWARD_RUNS) --outcomes off drop released_early slip edge_grasp pressed freeze_holding same_shape \
+		--episodes 3 --seed 3920000 --out runs/weights/failures
 	$(BIN)/touchgoal train-encoder surfaces --out runs/surfaces
 	$(BIN)/touchgoal train-encoder words --data runs/wand/episodes runs/weights/grasps/episodes \
 		--encoder runs/surfaces/encoder --out runs/words
-	$(BIN)/touchgoal fit-normalizer runs/weights/successes/episodes --encoder runs/words/encoder \
-		--modalities image tactile text --value --out runs/weights/fit
-	cp runs/words/encoder/* runs/weights/fit/normalizer.json runs/weights/fit/value.* encoders/weights/gelsight_mini/
+	$(BIN)/touchgoal fit-normalizer $(REWARD_SETS:%=runs/weights/%/episodes) --encoder runs/words/encoder \
+		--modalities image tactile text --value --judge --out runs/weights/fit
+	cp runs/words/encoder/* $(addprefix runs/weights/fit/,normalizer.json value.* goal.npz judge.json) \
+		encoders/weights/gelsight_mini/
 
 # The aligned encoder of the Mini with markers: about 25 minutes.
 MARKERS := --env.sensor gelsight_mini_markers

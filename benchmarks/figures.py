@@ -67,6 +67,15 @@ def judged(metrics: Metrics) -> str:
     return f"precision {row['precision']:.2f} ({name}); AUC {worst['auc']:.2f} ({kind})"
 
 
+def verdicts(metrics: Metrics) -> str:
+    """Shares of true successes and of failures that a judge calls successes."""
+    shares = []
+    for success, kind in ((True, "successes"), (False, "failures")):
+        told = [r["verdict"] for r in metrics["deployments"] if r["success"] is success]
+        shares.append(f"of {kind} {SuccessRate(told.count('success'), len(told))}")
+    return "; ".join(shares)
+
+
 def imitated(metrics: Metrics) -> str:
     """Success of policies whose demonstrations were weighted by each reward, all seeds together."""
     found = {

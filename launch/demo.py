@@ -1,7 +1,8 @@
 """The MMWand paper's robot experiment in simulation, on the shipped weights.
 
 A Franka FR3 with a GelSight Mini on each finger picks an object up and places it. Until it lets go, the
-distance to the goal is drawn: in the camera's image, in touch, to a sentence, and of all parts fused.
+distance to the goal is drawn: in the camera's image, in touch, to a sentence, and of all parts fused. The
+judge that ships says whether it ended in success.
 """
 
 from dataclasses import replace
@@ -45,6 +46,7 @@ def main(config: Config) -> None:
     from touchgoal.episodes.recording import EpisodeSpec, record_with_film
     from touchgoal.episodes.store import EpisodeWriter
     from touchgoal.rewards.goals import Inputs
+    from touchgoal.rewards.judging.judge import SHIPPED_JUDGE
     from touchgoal.rewards.report.plot import curve_colors
     from touchgoal.rewards.report.report import write_report
     from touchgoal.rewards.report.tables import metrics_table
@@ -66,12 +68,15 @@ def main(config: Config) -> None:
     env.close()
     held = until_release(episode)
     EpisodeWriter(out / "episodes", hz).append(held)
-    curves = reward.curves(reward.embedder.embed_episode(held, hz, str(held.meta["object"])))
+    embedded = reward.embedder.embed_episode(held, hz, str(held.meta["object"]))
+    curves = reward.curves(embedded)
+    judged = Reward.of_judge(SHIPPED_JUDGE).prepare(inputs).judge_episode(embedded)
     write_report(curves, out, "curves", reward.provenance())
     shown = {name: curves.costs[name] for name in FILMED}
     film = out / "episode.mp4"
     write_film(film, images, episode, hz, shown, "distance to goal", curve_colors(FILMED))
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
+    print(f"the judge, which sees and feels alone, says: {judged}")
     write_json(out / "metrics.json", {k: m.as_dict() for k, m in curves.metrics().items()})
     print(metrics_table([curves]))
     print(f"film: {film}\ncurves: {out / 'curves.png'}\n\n{what_next(out)}")

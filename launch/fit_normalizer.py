@@ -21,7 +21,7 @@ class Config:
     """Options of fit-normalizer."""
 
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """A set of episodes; or at least two video files or folders of images, each of one success."""
+    """Sets of episodes; or at least two video files or folders of images, each of one success."""
     modalities: tuple[Literal["image", "tactile", "text"], ...] = ()
     """Modalities to fit: image and tactile by default, as far as the episodes have them; name text, too,
     for goals that are sentences."""

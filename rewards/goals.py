@@ -61,6 +61,11 @@ class Inputs:
         return self.scene if self.scene.startswith("simulated") else self.task
 
     @property
+    def kind(self) -> tuple[object, ...]:
+        """What recordings must share to be fitted together."""
+        return self.fitted_task, self.camera, self.cameras, self.sides, self.sensor
+
+    @property
     def modalities(self) -> tuple[Modality, ...]:
         """Modalities that can be measured, given an aligned touch encoder."""
         image: tuple[Modality, ...] = () if self.camera is None else ("image",)

@@ -17,13 +17,13 @@ import numpy as np
 
 from benchmarks.deployment.deployed_episode import REFUSED, Deployment, Scene, deploy, deployed_twin
 from benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.papers.reward_objects import TRAINING_OBJECTS
 from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.rewards.judging.judge import SHIPPED_JUDGE, find_judge
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Positive, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.scene.objects import CATALOGUE
 
 Kind = Literal["policy", "beside", "missed", "cut short"]
 _BESIDE = 0.04, 0.08  # m from the goal, or from the grasp
@@ -37,7 +37,7 @@ class Config(BenchmarkOptions):
     """Judge, named as for touchgoal judge."""
     policy: str = "shipped"
     """Policy, named as for deploy."""
-    objects: tuple[str, ...] = tuple(CATALOGUE)
+    objects: tuple[str, ...] = TRAINING_OBJECTS
     """Objects, taken in turn: those of the judge's successes."""
     episodes: Count = 40
     """Deployments of the policy."""

@@ -8,7 +8,7 @@ is detected, with hysteresis (`ContactReader`): before contact only the other pa
 fused cost.
 
     front, wrist  pooled features of the camera of that name
-    wrist_map     feature map of the wrist camera at stride 16: where objects are in the hand's frame
+    wrist_map     worst cells of the wrist camera's map at stride 16: where things are in the hand's frame
     object        touch embedding: which object is held
     centre        where on the fingertips the object is held
     held          whether the fingertips touch
@@ -54,15 +54,16 @@ SPREAD_QUANTILE = 0.9  # of distances between ends that all succeeded: their spr
 _NO_CONTACT = 0.02  # m between two centres of which one is missing: about the width of a gel
 _SOFTNESS = 8.0  # exponent of the soft minimum
 _WRIST_MAP = "wrist_map"
-_CHUNK = 256  # frames of maps in float64 at once
+_WORST = 0.1  # share of a map's positions: what lies elsewhere than at the goal covers few of them
+_CHUNK = 64  # frames of maps in float64 at once
 SMOOTHING = 0.1  # time constant of the causal smoothing, s
 
 
 def part_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndarray, "n g"]]:
     """Return the distance of each frame to each goal, for the parts that both have.
 
-    Images: cosine distance, at stride 16 its mean over positions. Object: half the squared
-    distance of embeddings. Force: N, of the mean over the fingertips. Centre: m. Held: 0 or 1.
+    Images: cosine distance, at stride 16 its mean over the worst tenth of the positions. Object: half
+    the squared distance of embeddings. Force: N, of the mean over the fingertips. Centre: m. Held: 0 or 1.
     Slip: m, whatever the goal. These are means over the fingertips. Wrench: N.
     """
     distances = {}
@@ -92,13 +93,14 @@ def cosine_distances(
 def map_distances(
     mine: Float16[np.ndarray, "n c y x"], goals: Float16[np.ndarray, "g c y x"]
 ) -> Float[np.ndarray, "n g"]:
-    """Return 1 - cos at each position of two maps, mean over the positions."""
-    theirs, positions = unit_map(goals), goals.shape[2] * goals.shape[3]
-    chunks = [
-        np.tensordot(unit_map(mine[i : i + _CHUNK]), theirs, ((1, 2), (1, 2)))
-        for i in range(0, len(mine), _CHUNK)
-    ]
-    return 1 - np.concatenate(chunks) / positions
+    """Return 1 - cos at the positions of two maps, mean over the worst tenth of the positions."""
+    theirs = unit_map(goals).transpose(2, 1, 0)
+    worst = max(1, round(_WORST * len(theirs)))
+    chunks = []
+    for i in range(0, len(mine), _CHUNK):
+        apart = 1 - unit_map(mine[i : i + _CHUNK]).transpose(2, 0, 1) @ theirs
+        chunks.append(np.partition(apart, -worst, axis=0)[-worst:].mean(0))
+    return np.concatenate(chunks)
 
 
 def object_distances(

@@ -70,15 +70,18 @@ def open_successes(
     keys: Mapping[str, str] | None = None,
     background: Sequence[Path] = (),
 ) -> tuple[list[Source], list[EpisodeTrajectory]]:
-    """Open the successful episodes of one set, or several plain videos of successes; and the set's failures.
+    """Open the successful episodes of sets, or several plain videos of successes; and the sets' failures.
 
     With `assume_success` episodes without a recorded outcome count. UserError: as `open_source`; no
-    source, several sets, or sets and videos; fewer than two successes.
+    source, sets of different tasks, cameras or sensors, or sets and videos; fewer than two successes.
     """
     sources = [open_source(p, camera, (), with_touch, None, keys, background) for p in paths]
     sets = [s for s in sources if isinstance(s.trajectories[0], EpisodeTrajectory)]
-    if not sources or len(sets) > 1 or (sets and len(sources) > 1):
-        raise UserError("give one set of episodes, or several videos")
+    if not sources or 0 < len(sets) < len(sources):
+        raise UserError("give sets of episodes, or several videos")
+    for path, other in zip(paths, sets, strict=False):
+        if other.inputs.kind != sets[0].inputs.kind:
+            raise UserError(f"{path} has another task, camera or sensor than {paths[0]}: fit it alone")
     for skipped in (one for source in sources for one in source.skipped):
         if not sets:
             raise UserError(f"{skipped.name} is broken: {skipped.reason}")
@@ -87,7 +90,7 @@ def open_successes(
     if sets and None in success.values() and not assume_success:
         unknown = list(success.values()).count(None)
         raise UserError(
-            f"{unknown} of {len(success)} episodes of {paths[0]} have no recorded outcome: give "
+            f"{unknown} of {len(success)} episodes of {sets[0]} have no recorded outcome: give "
             "--assume-success if they succeeded"
         )
     if sets:

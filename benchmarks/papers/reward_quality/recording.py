@@ -21,7 +21,7 @@ and one grip force."""
 SCENES: tuple[Scene, ...] = ("elsewhere", "fixed")
 _FIXED: dict[str, Any] = {"start": (0.5, -0.1), "goal": (0.5, 0.1), "grasp_force": 10.0}
 SUBOPTIMAL: tuple[Outcome, ...] = ("slow", "regrasped")
-KINDS = tuple(o for o in OUTCOMES if o not in ("success", *SUBOPTIMAL))
+KINDS: tuple[Outcome, ...] = tuple(o for o in OUTCOMES if o not in ("success", *SUBOPTIMAL))
 """Outcomes that are failures."""
 
 _ATTEMPTS = 6  # rounds in which what did not come out as asked is drawn again
