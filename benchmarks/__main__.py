@@ -65,6 +65,10 @@ BENCHMARKS = {
         "deployment.judged",
         "verdicts of a judge on deployments without a simulator's",
     ),
+    "first-look": (
+        "deployment.first_look",
+        "what pick-and-place finds under changes of camera, table and light",
+    ),
     "faults": ("deployment.faults", "what a deployment does under every fault"),
     "policy-delay": ("deployment.policy_delay", "success under delays, or by cause of failure"),
     "own-task": ("deployment.own_task", "a task known by demonstrations alone: success by sight"),

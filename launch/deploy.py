@@ -122,7 +122,8 @@ def load_policy(cell: "CellConfig") -> "tuple[Planner | None, tuple[int, int]]":
             raise UserError(
                 f"{EPISODE_OBJECT} is known in run-policy alone: name the object itself"
             )
-        policy = SavedPolicy(find_policy(name, cell.task.simulated)).with_target(target)()
+        folder = find_policy(name, cell.task.simulated)
+        policy = SavedPolicy(folder, front_camera=options.front_camera).with_target(target)()
         options = policy.env_config(options, cell.task.name)
     check_sensors(cell, options.tactile, options.cameras)
     return policy, options.camera_size

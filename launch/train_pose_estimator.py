@@ -11,7 +11,7 @@ from pathlib import Path
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig
 from touchgoal.runtime.option_types import Count, checked_dataclass
-from touchgoal.sim_envs.config import CameraPlacement, PickPlaceConfig
+from touchgoal.sim_envs.config import USUAL_CAMERA, CameraPlacement, PickPlaceConfig
 
 
 @checked_dataclass
@@ -26,7 +26,7 @@ class Config(TrainerOptions):
     """Renderings of each scene: objects moved and painted, some of them hidden."""
     train: PoseTrainConfig = PoseTrainConfig()
     """Epochs and learning rate."""
-    front_camera: CameraPlacement | None = None
+    front_camera: CameraPlacement = USUAL_CAMERA
     """The front camera as calibrate-camera measured yours, in the base frame: x y z (m), quaternion wxyz (z
     looks ahead, y down), vertical field of view (degrees)."""
     workers: Count = os.cpu_count() or 1
@@ -51,7 +51,8 @@ def main(config: Config) -> None:
     first_seed = seeds.POSE_TRAINING.first(config.scenes, "--scenes")
     out = open_training(config, "train-pose-estimator")
     torch.manual_seed(config.seed)
-    network, known = PoseEstimator(PoseEstimatorConfig()), provenance()
+    network = PoseEstimator(PoseEstimatorConfig(front_camera=config.front_camera))
+    known = provenance()
     env = PickPlaceConfig(
         tactile=False,
         cameras=("front",),

@@ -15,6 +15,7 @@ from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_pose_estimator
 from touchgoal.runtime.errors import UserError, unknown_name
+from touchgoal.sim_envs.config import CameraPlacement
 
 TOUCH, ESTIMATOR = "touch", "estimator"  # folders beside a policy's weights
 EPISODE_OBJECT = "{object}"  # in a target: the object that the simulated episode asks for
@@ -55,6 +56,8 @@ class SavedPolicy:
         directory: of the policy, with its touch encoder in `touch/`, its pose estimator in
             `estimator/`.
         plan_ticks: control ticks by which its plans come late, see `LearnedPolicy`.
+        front_camera: where a calibrated camera stands, see `StateEstimator`; in simulation the
+            environment says it.
         target: the object to pick up, in words, with `EPISODE_OBJECT` for the name of that which the
             simulated episode asks for; "" if it is the only one.
     """
@@ -62,6 +65,7 @@ class SavedPolicy:
     directory: Path
     plan_ticks: int = 0
     target: str = ""
+    front_camera: CameraPlacement | None = None
 
     def __call__(self, env: Any = None) -> LearnedPolicy:
         """Return the policy at an episode's beginning; its plans come as late as `env` says."""
@@ -69,7 +73,8 @@ class SavedPolicy:
         target = self.target
         if env and EPISODE_OBJECT in target:
             target = target.replace(EPISODE_OBJECT, env.asked_name)
-        estimator = StateEstimator(pose_estimator, target) if pose_estimator else None
+        camera = self.front_camera if env is None else env.calibrated_camera()
+        estimator = StateEstimator(pose_estimator, target, camera) if pose_estimator else None
         plan_ticks = max(self.plan_ticks, env.plan_ticks if env else 0)
         return LearnedPolicy(network, touch, estimator, plan_ticks, self.directory)
 

@@ -7,6 +7,7 @@ from pydantic import Field
 from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import FIXED, Count, Positive, checked_dataclass
+from touchgoal.sim_envs.config import USUAL_CAMERA, CameraPlacement
 
 Head = Literal["small", "published", "tiny", "mlp", "regression"]
 """A diffusion head with a U-Net of that size or a multilayer perceptron, or one that predicts a plan
@@ -85,6 +86,7 @@ class PoseEstimatorConfig:
     # Crop of each camera's images that shows the table: column of the episodes, then rows and
     # columns (from, to; from, to), px.
     crops: tuple[tuple[str, Box], ...] = ((ft.FRONT, (80, 256, 0, 256)),)
+    front_camera: CameraPlacement = USUAL_CAMERA  # where it stood in training, up to its changes
     scene_keypoints: int = 16  # of the whole image at half its size: how the camera stands
     finder_channels: int = 48  # maps of the first look, for object and goal; cells of 8 x 8 px
     # Side of the second look, a square around each of them, px. It must hold the largest object

@@ -122,6 +122,8 @@ NO_RANDOMIZATION = SensorRandomization(
 CameraPlacement = tuple[float, float, float, float, float, float, float, float]
 """Place (x, y, z, m), orientation (quaternion wxyz; z looks ahead, y down) and vertical field of view
 (degrees) of a camera."""
+USUAL_CAMERA: CameraPlacement = (1.15, 0.0, 0.55, -0.336798, 0.621745, 0.621745, -0.336798, 40.0)
+"""The front camera unless `front_camera` says otherwise, in the base frame."""
 
 
 @checked_dataclass

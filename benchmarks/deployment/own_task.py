@@ -30,7 +30,7 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Positive, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
 
-_TASK, _OBJECT = "block on disc", "wooden_block"
+TASK, OBJECT = "block on disc", "wooden_block"
 _RECORDED = {"demonstrations": seeds.TRAINING, "validation": seeds.VALIDATION}
 
 
@@ -55,20 +55,12 @@ def run(config: Config) -> dict[str, Any]:
     work = config.work
     work.mkdir(parents=True, exist_ok=True)
     counts = config.demonstrations, max(1, config.demonstrations // 10)
-    scene = Scene("pick-place", config.seed, _OBJECT)
+    scene = Scene("pick-place", config.seed, OBJECT)
     with TemporaryDirectory() as name, deployed_twin(scene, True, Path(name), 0) as cell:
-        for (kind, drawn), count in zip(_RECORDED.items(), counts, strict=True):
-            if not (work / kind).exists():
-                _touchgoal(
-                    "record-demos", cell, "--task", _TASK, "--device", "scripted", "--seed", drawn.start,
-                    "--episodes", count, "--yes", "--out", work / kind,
-                )  # fmt: skip
-            if (held := len(EpisodeSet(work / kind / "episodes"))) < count:
-                raise UserError(f"{work / kind} holds {held} of {count} recordings: remove it")
+        data, validation = demonstrate(cell, work, counts)
         policy = work / "policy"
         if not (policy / POLICY).exists():
-            data, validation = (work / kind / "episodes" for kind in _RECORDED)
-            _touchgoal(
+            touchgoal(
                 "train-policy", "--preset", "sight", "--data", data, "--validation", validation,
                 "--out", policy,
             )  # fmt: skip
@@ -77,23 +69,37 @@ def run(config: Config) -> dict[str, Any]:
             _deploy(cell, policy, seed, config) for seed in track(drawn, "deploying", "deployment")
         ]
     rate = SuccessRate(sum(row.success for row in rows), len(rows))
-    lines = [f"{_TASK}, {config.demonstrations} demonstrations: {rate} [95 % Wilson]"]
+    lines = [f"{TASK}, {config.demonstrations} demonstrations: {rate} [95 % Wilson]"]
     lines += [
         f"    {r.seed}: progress {r.progress or 0:.2f}, {r.ending}" for r in rows if not r.success
     ]
     return {"table": "\n".join(lines), "deployments": [asdict(row) for row in rows]}
 
 
+def demonstrate(cell: Path, work: Path, counts: tuple[int, int]) -> tuple[Path, Path]:
+    """Record demonstrations to train and to validate on, unless the folder has them; return both sets."""
+    for (kind, drawn), count in zip(_RECORDED.items(), counts, strict=True):
+        if not (work / kind).exists():
+            touchgoal(
+                "record-demos", cell, "--task", TASK, "--device", "scripted", "--seed", drawn.start,
+                "--episodes", count, "--yes", "--out", work / kind,
+            )  # fmt: skip
+        if (held := len(EpisodeSet(work / kind / "episodes"))) < count:
+            raise UserError(f"{work / kind} holds {held} of {count} recordings: remove it")
+    data, validation = (work / kind / "episodes" for kind in _RECORDED)
+    return data, validation
+
+
 def _deploy(cell: Path, policy: Path, seed: int, config: Config) -> Deployment:
-    scene, out = Scene("pick-place", seed, _OBJECT), cell.parent / str(seed)
-    done = deploy(cell, scene, str(policy), "lock-step", config.seconds, out, _TASK)
+    scene, out = Scene("pick-place", seed, OBJECT), cell.parent / str(seed)
+    done = deploy(cell, scene, str(policy), "lock-step", config.seconds, out, TASK)
     if done.ending.startswith(REFUSED):  # the twin still has the scene before
         return done
     truth = ask_twin(read_cell_file(cell).task.twin, "truth")
     return replace(done, success=truth["success"], progress=truth["progress"])
 
 
-def _touchgoal(*arguments: object) -> None:
+def touchgoal(*arguments: object) -> None:
     """Run a command; UserError with the end of what it says if it fails."""
     command = [sys.executable, "-m", "touchgoal.launch", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

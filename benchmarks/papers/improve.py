@@ -1,12 +1,16 @@
-"""A task of one's own from few demonstrations, improved by its own runs, as `touchgoal improve` does it.
+"""A task of one's own from few demonstrations, improved by its own runs over the wire, as `touchgoal improve` does it.
 
-The runs are filtered by a judge, by the simulator's truth, or not at all; the first round's runs, by the policy
-of the demonstrations alone, are the same in all. A block goes on a disc, by sight. No success ends a run; a trial
-counts if the block lies where it should at the end. What the folder of an earlier run holds is taken from there.
+A scripted device leads the arm of a twin to put a block on a disc; a policy learns it by sight, runs, and is
+trained on what is accepted as well: by a judge that is fitted on the demonstrations alone, by the twin's
+truth, or all of it. The first round's runs are the same in all. What the folder of an earlier run holds is taken from
+there.
 """
 
 import shutil
-from dataclasses import asdict
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,51 +18,102 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from benchmarks.deployment.deployed_episode import Scene, deploy, deployed_twin
+from benchmarks.deployment.own_task import OBJECT, TASK, demonstrate, touchgoal
 from benchmarks.options import CORES, BenchmarkOptions
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.episodes.outcomes.judged import JudgedOutcome
-from touchgoal.episodes.recording import EpisodeSpec, collect, missing_specs
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.improve import judge_set, train_accepted
-from touchgoal.policies.by_name import choose_policy
-from touchgoal.policies.evaluation.evaluate import run_trials, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
-from touchgoal.policies.training.dagger import DaggerRoles
-from touchgoal.policies.training.improve import (
-    Improvement,
-    Round,
-    record_simulated,
-    simulation_of,
-    true_outcomes,
-)
-from touchgoal.rewards.judging.judge import SHIPPED_JUDGE
+from touchgoal.policies.training.improve import Improvement
+from touchgoal.rewards.judging.judge import JUDGE
 from touchgoal.runtime import seeds
-from touchgoal.runtime.option_types import Count, checked_dataclass
-from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.runtime.json_file import parse_json, write_json
+from touchgoal.runtime.option_types import Count, Positive, checked_dataclass
 
 Filter = Literal["judge", "truth", "none"]
-_DEMONSTRATED = PickPlaceConfig(objects=("wooden_block",), rest=1.0, disturbance=0.01)
+_TRIED = seeds.DEPLOY_TEST.start + 500_000  # scenes of the trials
+_TRUTH = "truth.json"  # of the runs of a folder, in their order; no training reads it
 
 
 @checked_dataclass
 class Config(BenchmarkOptions):
     """Options of benchmark improve."""
 
-    judge: str = SHIPPED_JUDGE
-    """Judge of filter judge, named as for touchgoal judge; fitted on other episodes than these."""
     filters: tuple[Filter, ...] = get_args(Filter)
-    """What accepts runs: a judge, the simulator's truth, or nothing (all are accepted)."""
+    """What accepts runs: a judge fitted on the demonstrations, the twin's truth, or nothing (all are)."""
     demonstrations: Count = 15
-    """Demonstrations by the feedback expert; a fifth as many are recorded to validate on."""
+    """Demonstrations; a fifth as many are recorded to validate on."""
     rounds: Count = 3
     """Rounds of runs and training."""
-    runs: Count = 50
+    runs: Count = 20
     """Runs in each round."""
-    trials: Count = 40
-    """Trials of the policy before and of those after, on other scenes."""
+    trials: Count = 20
+    """Deployments of the policy before and of those after, on other scenes."""
+    seconds: Positive = 30.0
+    """Time limit of a run, s."""
     train: str = "--preset sight"
     """Options of train-policy."""
     workers: Count = CORES
-    """Processes that simulate."""
+    """Filters side by side."""
+
+
+@dataclass(frozen=True)
+class _Lab:
+    """Runs, trainings and trials of one filter, on a twin of its own."""
+
+    config: Config
+    out: Path
+    number: int  # of the twin
+
+    @contextmanager
+    def twin(self) -> Iterator[Path]:
+        scene = Scene("pick-place", _TRIED, OBJECT)
+        with (
+            TemporaryDirectory() as name,
+            deployed_twin(scene, True, Path(name), self.number) as cell,
+        ):
+            yield cell
+
+    def run(self, policy: Path, seeds_: range, out: Path) -> Iterator[bool]:
+        """Deploy a policy in scenes, its episodes into `out`; yield the twin's truth of each."""
+        with self.twin() as cell:
+            for seed in seeds_:
+                scene = Scene("pick-place", seed, OBJECT)
+                deploy(cell, scene, str(policy), "lock-step", self.config.seconds, out, TASK)
+                yield bool(ask_twin(read_cell_file(cell).task.twin, "truth")["success"])
+
+    def record(self, policy: Path, root: Path, numbers: range) -> None:
+        """Append runs to a set, and their truth to a file beside it."""
+        file = root.parent / _TRUTH
+        known = parse_json(file.read_bytes())[: numbers.start] if file.exists() else []
+        first = seeds.IMPROVEMENT.start
+        drawn = range(first + numbers.start, first + numbers.stop)
+        for true in self.run(policy, drawn, root.parent):
+            known.append(true)
+            write_json(file, known)
+
+    def success(self, policy: Path) -> SuccessRate:
+        """Return the success of a policy in the trials."""
+        file = policy.parent / "trials.json"
+        if not file.exists():
+            drawn = range(_TRIED, _TRIED + self.config.trials)
+            with TemporaryDirectory() as name:
+                write_json(file, list(self.run(policy, drawn, Path(name))))
+        tried = parse_json(file.read_bytes())
+        return SuccessRate(sum(tried), len(tried))
+
+    def improve(self, name: Filter, data: Path, validation: Path, rounds: int) -> Improvement:
+        """Return what goes through rounds with a filter; no round is done yet."""
+        folder, train = self.out / name, partial(train_accepted, validation, self.config.train)
+        label = {
+            "judge": partial(judge_set, str(self.out / "judge-fit")),
+            "truth": partial(_truth, folder, len(EpisodeSet(data))),
+            "none": _everything,
+        }[name]
+        return Improvement(folder, data, self.config.runs, self.record, label, train)
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -70,68 +125,61 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _run(config: Config, out: Path) -> dict[str, Any]:
-    data = _demonstrate(out / "demonstrations", seeds.TRAINING, config.demonstrations, config)
-    fifth = max(1, config.demonstrations // 5)
-    validation = _demonstrate(out / "validation", seeds.VALIDATION, fifth, config)
-    env = simulation_of(EpisodeSet(data))
-    assert env is not None
-    record = partial(record_simulated, env, config.workers)
-    train = partial(train_accepted, validation, config.train)
-
-    def success(policy: Path) -> SuccessRate:
-        make, needed = choose_policy(policy, env)
-        specs = trial_specs(needed, config.trials, seeds.POLICY_TEST.start)
-        trials = list(run_trials(needed, make, specs, config.workers))
-        return SuccessRate(sum(t.success for t in trials), len(trials))
-
-    first = Improvement(out / "first", data, config.runs, record, _everything, train)
-    assert not list(first.rounds(0))
+    lab = _Lab(config, out, 0)
+    with lab.twin() as cell:
+        counts = config.demonstrations, max(1, config.demonstrations // 5)
+        data, validation = demonstrate(cell, out, counts)
+    if "judge" in config.filters and not (out / "judge-fit" / JUDGE).exists():
+        shutil.rmtree(out / "judge-fit", ignore_errors=True)
+        touchgoal("fit-normalizer", data, "--value", "--judge", "--out", out / "judge-fit")
+    first = lab.improve("none", data, validation, 0)
+    for _ in first.rounds(0):
+        pass
     root = first.out / "episodes"
-    if (done := len(EpisodeSet(root)) - config.demonstrations) < config.runs:
-        record(first.policy(0), root, range(done, config.runs))
-    before = success(first.policy(0))
+    if (done := len(EpisodeSet(root)) - len(EpisodeSet(data))) < config.runs:
+        lab.record(first.policy(0), root, range(done, config.runs))
+    for name in config.filters:
+        if not (folder := out / name).exists():
+            shutil.rmtree(out / "unfinished", ignore_errors=True)
+            shutil.copytree(first.out, out / "unfinished")
+            (out / "unfinished").rename(folder)
+
+    def improved(job: tuple[int, Filter]) -> dict[str, Any]:
+        own = _Lab(config, out, 1 + job[0])
+        work = own.improve(job[1], data, validation, config.rounds)
+        said = [v for done in work.rounds(config.rounds) for v in done.verdicts]
+        true = parse_json((work.out / _TRUTH).read_bytes())
+        accepted = [t for t, v in zip(true, said, strict=True) if v == "success"]
+        return {
+            "successes": own.success(work.policy(config.rounds)).successes,
+            "accepted": len(accepted),
+            "right": float(np.mean(accepted)) if accepted else 0.0,
+            "rounds": [sum(true[i : i + config.runs]) for i in range(0, len(true), config.runs)],
+        }
+
+    before = lab.success(first.policy(0))
+    with ThreadPoolExecutor(config.workers) as pool:
+        rows = dict(zip(config.filters, pool.map(improved, enumerate(config.filters)), strict=True))
     lines = [
         f"{config.demonstrations} demonstrations, {config.rounds} rounds of {config.runs} runs; "
         "success of policies in trials [95 % Wilson]",
         f"{'filter':<8}{'success':>22}{'accepted':>10}{'of them right':>15}  right runs by round",
         f"{'before':<8}{before!s:>22}",
     ]
-    rows: dict[str, list[dict[str, Any]]] = {"before": [{"successes": before.successes}]}
-    for name in config.filters:
-        if not (folder := out / name).exists():
-            shutil.rmtree(out / "unfinished", ignore_errors=True)
-            shutil.copytree(first.out, out / "unfinished")
-            (out / "unfinished").rename(folder)
-        label = {"judge": partial(judge_set, config.judge), "truth": _truth, "none": _everything}
-        work = Improvement(folder, data, config.runs, record, label[name], train)
-        rounds = list(work.rounds(config.rounds))
-        after, (accepted, right) = success(work.policy(config.rounds)), _accepted(rounds)
-        each = " ".join(str(sum(r.true or [])) for r in rounds)
-        lines.append(f"{name:<8}{after!s:>22}{accepted:>10}{right:>15.0%}  {each}")
-        known = {"accepted": accepted, "right": right, "rounds": [asdict(r) for r in rounds]}
-        rows[name] = [{"successes": after.successes, **known}]
-    return {"table": "\n".join(lines), "trials": config.trials, "imitation": rows}
-
-
-def _demonstrate(folder: Path, drawn: seeds.SeedRange, count: int, config: Config) -> Path:
-    specs = [EpisodeSpec(drawn.start + i) for i in range(count)]
-    if missing := missing_specs(folder, specs):
-        collect(folder, _DEMONSTRATED, missing, config.workers, DaggerRoles())
-    return folder
+    for name, row in rows.items():
+        after, each = (
+            SuccessRate(row["successes"], config.trials),
+            " ".join(map(str, row["rounds"])),
+        )
+        lines.append(f"{name:<8}{after!s:>22}{row['accepted']:>10}{row['right']:>15.0%}  {each}")
+    found = {"before": [{"successes": before.successes}]} | {k: [v] for k, v in rows.items()}
+    return {"table": "\n".join(lines), "trials": config.trials, "imitation": found}
 
 
 def _everything(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
     return {i: JudgedOutcome("success") for i in range(len(episodes))}
 
 
-def _truth(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
-    true = true_outcomes(episodes, range(len(episodes))) or []
-    return {i: JudgedOutcome("success" if right else "failure") for i, right in enumerate(true)}
-
-
-def _accepted(rounds: list[Round]) -> tuple[int, float]:
-    """Return the number of accepted runs, and the share of them that are successes."""
-    true = [
-        t for r in rounds for v, t in zip(r.verdicts, r.true or [], strict=True) if v == "success"
-    ]
-    return len(true), float(np.mean(true)) if true else 0.0
+def _truth(folder: Path, first: int, episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
+    true = [True] * first + parse_json((folder / _TRUTH).read_bytes())
+    return {i: JudgedOutcome("success" if t else "failure") for i, t in enumerate(true)}

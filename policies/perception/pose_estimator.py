@@ -41,6 +41,7 @@ class Look:
     found: Float[Tensor, "b 2"]  # share of the scores near the object and near the goal, in [0, 1]
     # Length of (cos, sin) of twice the yaw: 1 if sure, less where two yaws are as likely.
     turned: Float[Tensor, " b"]
+    places: Places
 
     @property
     def sureness(self) -> tuple[float, float, float]:
@@ -97,7 +98,7 @@ class PoseEstimator(nn.Module):
         places = {key: place for key, (place, _) in found.items()}
         start = self.start_normalizer.inverse(self.scaled(lit, scene, places))
         surest = torch.stack([share for _, share in found.values()]).amax(0)
-        return Look(start, surest, start[:, 3:5].norm(dim=1))
+        return Look(start, surest, start[:, 3:5].norm(dim=1), places)
 
     def scores(
         self, images: Images, words: Float[Tensor, "b d"]

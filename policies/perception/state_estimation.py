@@ -16,14 +16,20 @@ from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.config import PoseEstimatorConfig
-from touchgoal.policies.perception.pose_estimator import Images, PoseEstimator, evenly_lit
+from touchgoal.policies.perception.pose_estimator import Images, Look, PoseEstimator, evenly_lit
 from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
+from touchgoal.policies.perception.usual_view import UsualView
 from touchgoal.runtime.errors import RefusedError, UserError
+from touchgoal.sim_envs.config import CameraPlacement
 
 ESTIMATOR_FORMAT = WeightsFormat(
     "estimator", "pose estimator", "train one with: touchgoal train-pose-estimator"
 )
 _FARTHEST = 4.0  # standard deviations of the hand's start in training
+# m. A camera farther from the training's than there is not what the network knows; else its places lie
+# at most the second distance from the image's: a degree of a calibration's error is 16 mm.
+_ELSEWHERE, _APART = 0.03, 0.04
+_PLACES = [0, 1, 5, 6]  # x and y of the object and of the goal in `features.TRUTH_START`
 _OBJECT = 5  # numbers of `features.TRUTH_START` on the object
 _ASKED = ("where the object is", "where the disc is", "how the object is turned")
 # m. The object has moved if two later estimates agree within the first distance and lie the second
@@ -43,9 +49,21 @@ class StateEstimator:
         target: the object in words; "" if it is the only one.
     """
 
-    def __init__(self, pose_estimator: PoseEstimator, target: str = "") -> None:
-        """Use a network for inference."""
+    def __init__(
+        self,
+        pose_estimator: PoseEstimator,
+        target: str = "",
+        front_camera: CameraPlacement | None = None,
+    ) -> None:
+        """Use a network for inference.
+
+        `front_camera` is where a calibrated camera stands; None if that is not known.
+        """
         self.pose_estimator, self.target = pose_estimator, target
+        self._views: dict[str, UsualView] = {}
+        if front_camera is not None:
+            usual, size = pose_estimator.config.front_camera, pose_estimator.config.size
+            self._views[ft.FRONT] = UsualView(usual, front_camera, size)
         self.camera_size = pose_estimator.config.size
         self.cameras = tuple(key for key, _ in pose_estimator.config.crops)
         self._words = embed([target]) if target else torch.zeros(1, WORDS_WIDTH)
@@ -86,7 +104,8 @@ class StateEstimator:
                     f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): put "
                     "objects and disc in view, and say which one is meant (--target)"
                 )
-        self._start = self._latest = look.start[0].numpy()
+        self._start = self._latest = self._where(look)
+        self._check_camera(look)
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
         self._first, self._touched = first, False
 
@@ -99,11 +118,37 @@ class StateEstimator:
         look = self.pose_estimator.look(self._images(observation), self._words, self._scene)
         if any(sure < least for sure, least in zip(look.sureness, self._least, strict=True)):
             return
-        now, before = look.start[0].numpy(), self._latest
+        now, before = self._where(look), self._latest
         self._latest = now
         moved = np.linalg.norm(now[:2] - self._start[:2]) > _MOVED
         if moved and np.linalg.norm(now[:2] - before[:2]) < _AGREE:
             self._start = np.concatenate([(now + before)[:_OBJECT] / 2, self._start[_OBJECT:]])
+
+    def _where(self, look: Look) -> Float32[np.ndarray, "7"]:
+        """Return `features.TRUTH_START`; places from the view of a camera that stands elsewhere."""
+        start, view = look.start[0].numpy().copy(), self._views.get(ft.FRONT)
+        if view is not None and view.elsewhere > _ELSEWHERE:
+            start[_PLACES] = self._projected(view, look)
+        return start
+
+    def _projected(self, view: UsualView, look: Look) -> Float32[np.ndarray, "4"]:
+        """Return places of object and goal, x and y (m), by where they are in the image."""
+        seen = look.places[ft.FRONT][0].numpy().astype(np.float64)
+        object_, goal = (
+            view.place(*pair) for pair in zip(seen, (float(look.start[0, 2]), 0.0), strict=True)
+        )
+        return np.concatenate([object_, goal]).astype(np.float32)
+
+    def _check_camera(self, look: Look) -> None:
+        """Refuse a first look whose places the calibrated camera sees elsewhere than the network."""
+        if (view := self._views.get(ft.FRONT)) is None:
+            return
+        apart = (self._projected(view, look) - self._start[_PLACES]).reshape(2, 2)
+        if (far := np.linalg.norm(apart, axis=1).max()) > _APART:
+            raise RefusedError(
+                f"object or disc are {1e3 * far:.0f} mm from where the calibrated camera sees them: "
+                "calibrate it anew (calibrate-camera), and put nothing else in view"
+            )
 
     def _check_hand(self, tcp: Float32[Tensor, "1 7"]) -> None:
         """Refuse a start outside the training's hand poses, which would look like a moved camera."""
@@ -121,6 +166,8 @@ class StateEstimator:
         images = {}
         for key in self.cameras:
             image, size = observation[key], self.camera_size
+            if key in self._views:
+                image = self._views[key](image)
             if image.shape[:2] != size:
                 given, wanted = (f"{y} x {x}" for y, x in (image.shape[:2], size))
                 raise UserError(

@@ -81,7 +81,9 @@ def open_successes(
         raise UserError("give sets of episodes, or several videos")
     for path, other in zip(paths, sets, strict=False):
         if other.inputs.kind != sets[0].inputs.kind:
-            raise UserError(f"{path} has another task, camera or sensor than {paths[0]}: fit it alone")
+            raise UserError(
+                f"{path} has another task, camera or sensor than {paths[0]}: fit it alone"
+            )
     for skipped in (one for source in sources for one in source.skipped):
         if not sets:
             raise UserError(f"{skipped.name} is broken: {skipped.reason}")
