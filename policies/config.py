@@ -86,7 +86,6 @@ class PoseEstimatorConfig:
     # Crop of each camera's images that shows the table: column of the episodes, then rows and
     # columns (from, to; from, to), px.
     crops: tuple[tuple[str, Box], ...] = ((ft.FRONT, (80, 256, 0, 256)),)
-    front_camera: CameraPlacement = USUAL_CAMERA  # where it stood in training, up to its changes
     scene_keypoints: int = 16  # of the whole image at half its size: how the camera stands
     finder_channels: int = 48  # maps of the first look, for object and goal; cells of 8 x 8 px
     # Side of the second look, a square around each of them, px. It must hold the largest object
@@ -102,6 +101,7 @@ class PoseEstimatorConfig:
     # Least share of the first look near the object and near the goal, and least length of the vector
     # of the yaw, in which the estimate is trusted; training sets them.
     sure: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    front_camera: CameraPlacement = USUAL_CAMERA  # where it stood in training, up to its changes
 
 
 @checked_dataclass

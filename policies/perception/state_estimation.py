@@ -105,7 +105,7 @@ class StateEstimator:
                     "objects and disc in view, and say which one is meant (--target)"
                 )
         self._start = self._latest = self._where(look)
-        self._check_camera(look)
+        self._check_camera(look, first)
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
         self._first, self._touched = first, False
 
@@ -139,10 +139,16 @@ class StateEstimator:
         )
         return np.concatenate([object_, goal]).astype(np.float32)
 
-    def _check_camera(self, look: Look) -> None:
-        """Refuse a first look whose places the calibrated camera sees elsewhere than the network."""
+    def _check_camera(self, look: Look, first: Mapping[str, np.ndarray]) -> None:
+        """Refuse a first look at the edge of the image, or that the calibrated camera sees elsewhere."""
         if (view := self._views.get(ft.FRONT)) is None:
             return
+        seen = look.places[ft.FRONT][0].numpy().astype(np.float64)
+        if not all(view.shows(place, first[ft.FRONT]) for place in seen):
+            raise RefusedError(
+                "object or disc lie at the edge of what the camera sees: turn it so that all of the "
+                "table is in view, and calibrate it anew (calibrate-camera)"
+            )
         apart = (self._projected(view, look) - self._start[_PLACES]).reshape(2, 2)
         if (far := np.linalg.norm(apart, axis=1).max()) > _APART:
             raise RefusedError(

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from touchgoal.sim_envs.config import CameraPlacement
 
 _HEIGHT = 0.02  # m over the table, about the middle of the objects
+_MARGIN = 0.04  # of the image's height, about the radius of an object
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,15 @@ class UsualView:
         return cv2.warpPerspective(
             image, homography, self.size[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE
         )
+
+    def shows(self, seen: Float[np.ndarray, "2"], image: UInt8[np.ndarray, "h w 3"]) -> bool:
+        """Return whether the camera's own image shows what is around a place of the usual image, px."""
+        rows, columns = image.shape[:2]
+        homography = _from_table(self.here, rows, columns) @ self._to_table
+        column, row, scale = homography @ np.array([seen[1], seen[0], 1.0])
+        margin = _MARGIN * rows
+        inside = margin < row / scale < rows - margin
+        return bool(scale > 0 and inside and margin < column / scale < columns - margin)
 
     def place(self, seen: Float[np.ndarray, "2"], height: float) -> Float[np.ndarray, "2"]:
         """Return where (x, y, m, base frame) a point seen at a row and column is, at a height (m).

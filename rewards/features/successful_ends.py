@@ -29,7 +29,8 @@ class SuccessfulEnds:
     @classmethod
     def of(cls, episodes: Sequence[embedded.EmbeddedEpisode]) -> "SuccessfulEnds":
         """Take the end of each of some episodes that were embedded alike, whole or only their ends."""
-        ends = dict(embedded.last_rows(episodes))
+        unread = {name for name in episodes[0].features if name.endswith("_map")} - {"wrist_map"}
+        ends = {k: rows for k, rows in embedded.last_rows(episodes).items() if k not in unread}
         if len(episodes[0].features.get("held", ())) > START_FRAMES + 1:
             down = [put_down(e.features, e.fps) is not None for e in episodes]
             ends[embedded.PUT_DOWN] = np.array(down)
