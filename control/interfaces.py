@@ -211,6 +211,8 @@ class Actor:
     """Source of actions in a control loop or an environment; on an arm `act` takes less than a tick."""
 
     done = False  #: whether its plan has ended
+    given_up = ""  #: why it will not go on: the task has failed
+    recovers = False  #: whether it goes on where the hand has lost its object
     action_age = 0.0  #: s for which it has had no new answer
 
     def start(self, observation: Observation) -> None:

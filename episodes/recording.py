@@ -117,7 +117,7 @@ def run(
         recorded = np.asarray(expert.act(observation), np.float32) if expert else action
         yield {**observation, ft.ACTION: recorded, **info}
         observation, _, terminated, truncated, info = env.step(action)
-        if terminated or truncated:
+        if terminated or truncated or actor.given_up:
             break
     still = np.append(np.zeros(env.n_joints), recorded[-1]).astype(np.float32)
     yield {**observation, ft.ACTION: still, **info}

@@ -20,6 +20,7 @@ from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.perception.state_estimation import StateEstimator
+from touchgoal.policies.regrasp import Regrasp
 from touchgoal.policies.sight.average import KeyPoseAverage
 from touchgoal.policies.sight.frozen_images import ImageEmbedder
 from touchgoal.runtime.errors import RefusedError, UserError
@@ -55,6 +56,7 @@ class LearnedPolicy(Planner):
         directory: where it was read from; None if it never was on disk.
         plan_ticks: control ticks from an observation to its plan. The next plan is requested that
             much earlier, and its actions for the ticks gone by are dropped.
+        recovers: whether it tries again after the hand has lost its object, or closed on nothing.
         refuses_novelty: whether `plan` raises RefusedError once touch has been unlike the training
             for a second; set False to correct it there.
     """
@@ -88,6 +90,7 @@ class LearnedPolicy(Planner):
         self._network, self.touch, self._estimator = network, touch, estimator
         self._images = ImageEmbedder(config.images) if config.images else None
         self.plan_ticks, self.directory = plan_ticks, directory
+        self.recovers = self._learned_estimator is not None
         self.refuses_novelty = True
         self._check_delay(plan_ticks)
         self.observation_horizon = config.observation_horizon
@@ -102,15 +105,20 @@ class LearnedPolicy(Planner):
     def reset(self, seed: int = 0) -> None:
         """Begin an episode, whose first observation is untouched; `seed` is that of the plans' noise."""
         self._generator = torch.Generator().manual_seed(seed)
-        self._first: Observation = {}
+        self._begin({})
+        self._regrasp, self.given_up = Regrasp(self.control_hz), ""
+        self._recent: list[Observation] = []
+        self._todo: list[np.ndarray] = []  # actions of the present plan
+        self._next: list[np.ndarray] = []  # actions of the plan that comes next
+
+    def _begin(self, first: Observation) -> None:
+        """Begin to observe, from an observation without contact."""
+        self._first = first
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
         self._maps: tuple[Observation, Tensor] | None = None  # the latest embedded camera images
-        self._recent: list[Observation] = []
         self._novel_plans = 0  # in a row
         self._key_pose = KeyPoseAverage(self.execution_horizon / self.control_hz)
         self._width: float | None = None  # of the gripper, where the next plan begins, m
-        self._todo: list[np.ndarray] = []  # actions of the present plan
-        self._next: list[np.ndarray] = []  # actions of the plan that comes next
 
     def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
         """Return the action (`features.ACTION`) for the next tick."""
@@ -136,6 +144,8 @@ class LearnedPolicy(Planner):
 
         In an episode's first call the oldest observation is the untouched first one.
         """
+        if self._learned_estimator and (other := self._second_try(history[-1])) is not None:
+            return other
         with one_thread():
             self.embed(history)
             _, touch, state = zip(*self._embedded, strict=True)
@@ -155,6 +165,20 @@ class LearnedPolicy(Planner):
                 self._key_pose.change_gripper()
             self._width = width
             return actions
+
+    def _second_try(self, observation: Observation) -> Float32[np.ndarray, "h 8"] | None:
+        """Return the way back after the hand has closed on nothing; None: the policy acts."""
+        first, ticks = self._first or observation, self.config.prediction_horizon
+        what = self._regrasp.next(observation, first, self._width, self.execution_horizon)
+        if what == "look again":
+            self._begin(observation)
+            try:
+                self.embed([observation] * self.history_ticks)
+            except RefusedError as error:
+                self._regrasp.give_up(str(error))
+                what = "back"
+        self.given_up = self._regrasp.given_up
+        return self._regrasp.way_back(observation, first, ticks) if what == "back" else None
 
     def _refuse_novel(self, batch: ObservationBatch) -> None:
         """Raise RefusedError once touch has been unlike the training for a second of plans."""

@@ -12,7 +12,7 @@ from fake_cell import FakeCamera, FakeCell, FakeLoadCell
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.hand import HandMonitor, HeldObject
 from touchgoal.control.grippers.franka_hand import NonBlockingGripper
-from touchgoal.control.interfaces import DriverError, GripperReading, LoadReading
+from touchgoal.control.interfaces import Actor, DriverError, GripperReading, LoadReading
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import FR3
 
@@ -131,6 +131,28 @@ def test_an_object_lost_on_the_way_stops_the_arm() -> None:
     set_(cell.gripper, width=0.04, grasped=True)()
     ending = cell.run(at(20, set_(cell.gripper, width=0.0, grasped=False)))
     assert ending.stopped and "lost its object" in ending.reason
+
+
+class Recovers(Actor):
+    recovers = True
+    ticks = 0
+
+    def __init__(self, cell: FakeCell) -> None:
+        self.lose = at(20, set_(cell.gripper, width=0.0, grasped=False))
+
+    def act(self, observation: dict) -> np.ndarray:
+        self.ticks += 1
+        self.lose(self.ticks)
+        self.given_up = "it is gone" if self.ticks == 30 else ""
+        return np.array([*[0.0] * 7, 0.04])
+
+
+def test_a_policy_that_recovers_goes_on_until_it_gives_up() -> None:
+    cell = FakeCell()
+    set_(cell.gripper, width=0.04, grasped=True)()
+    ending = cell.run(lambda _: None, actor=Recovers(cell))
+    assert len(cell.rows) == 30 and not ending.stopped
+    assert (ending.reason, ending.done) == ("it is gone", False)
 
 
 def reading(width: float, grasped: bool) -> GripperReading:

@@ -187,6 +187,8 @@ class ControlLoop:
         while True:
             late = clock.now() - due
             ending = self._tick(actor, log, clock.now() - begin, late)
+            if ending is None and actor.given_up:
+                ending = Ending(actor.given_up, done=False)
             if ending is None and actor.done:
                 ending = Ending(PLAN_ENDED)
             if ending is None and clock.now() - begin > seconds:
@@ -242,7 +244,7 @@ class ControlLoop:
         log.clocks.extend((self._connection.clock.now(), reading.arm.time))
         if not self._execute:
             reading = self._as_commanded(reading)
-        if ending := self._device_fault(reading):
+        if ending := self._device_fault(reading, actor.recovers):
             return ending
         if request := self._operator_request():
             if request == "stop":
@@ -275,12 +277,17 @@ class ControlLoop:
         log.add(tick)
         return Ending(JUDGED, done=True) if cost is not None and cost.done else None
 
-    def _device_fault(self, reading: CellReading) -> Ending | None:
-        """Stop for a device that reports a fault, for a lost object or a hand that does not follow."""
+    def _device_fault(self, reading: CellReading, recovers: bool) -> Ending | None:
+        """Stop for a device that reports a fault, for a lost object or a hand that does not follow.
+
+        An actor that `recovers` goes on without the object.
+        """
         if reading.fault:
             return self.stop(reading.fault, "see above; then start deploy again")
         self._held.update(reading.gripper, self.width, float(reading.observation[ft.TCP_POSE][2]))
-        if self._held.lost:
+        if self._held.lost and recovers:
+            self._held = HeldObject()
+        elif self._held.lost:
             return self.stop("the hand has lost its object", "put it back, then start again")
         if not self._execute:
             return None

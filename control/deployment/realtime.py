@@ -56,7 +56,7 @@ class RealTimeActor(Actor):
                 sooner. Joint changes that it still holds back count as commanded.
             hand: yields to what it presses on; not with `lag`.
         """
-        self._planner, self._hand = planner, hand
+        self._planner, self._hand, self.recovers = planner, hand, planner.recovers
         # s from an observation to its plan, without the first plan
         self.latencies: list[float] = []
         self._lag = lag
@@ -91,7 +91,7 @@ class RealTimeActor(Actor):
 
     def act(self, observation: Observation) -> Float[np.ndarray, "8"]:
         """Return the action for this tick, as `lag` and `hand` change it."""
-        self.done = self._planner.done
+        self.done, self.given_up = self._planner.done, self._planner.given_up
         if self._hand is not None:
             return self._hand.add_to(self._answer(observation), observation)
         if self._lag is None:

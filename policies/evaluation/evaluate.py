@@ -24,6 +24,7 @@ from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tasks import make_env
 
 REFUSED = "refused"  # failure of an episode in which the policy would not act
+GAVE_UP = "gave up"  # of one in which it closed on nothing again and again
 _TOLERANCE = 1e-3  # rad or m by which an action may exceed a limit before it counts as clamped
 _LIGHT_TICKS = 10  # from one look at the fingertips' light to the next
 
@@ -158,12 +159,14 @@ def run_trial(
         judging = judge(env) if judge else None
         last = {**observation, ft.ACTION: np.zeros(env.action_space.shape or ()), **info}
         try:
-            for last in run(env, policy(env), observation, info):
+            actor = policy(env)
+            for last in run(env, actor, observation, info):
                 if len(rows) % _LIGHT_TICKS == 0:
                     light.update(last)
                 rows.append([last[key] for key in keys])  # images would fill the memory
                 if judging and judging.ended(last):
                     break
+            failed = [GAVE_UP] if actor.given_up else []
         except RefusedError:
             rows, failed = [*rows, [last[key] for key in keys]], [REFUSED]
         wrench, pads, progress, actions = (np.stack(column) for column in zip(*rows, strict=True))

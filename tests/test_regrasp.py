@@ -1,0 +1,76 @@
+"""A hand that closes on nothing, or loses its object, goes back and looks again; then it says that it failed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from touchgoal.control import features as ft
+from touchgoal.control.features import N_JOINTS, Observation
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
+from touchgoal.policies.evaluation.evaluate import GAVE_UP, run_trial, trial_specs
+from touchgoal.policies.regrasp import Regrasp
+from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
+
+HZ, TICKS = 20.0, 2
+
+
+def seen(joints: float, width: float) -> Observation:
+    arm = np.full(N_JOINTS, joints)
+    return {ft.STATE: np.array([*arm, *arm, width]), ft.COMMAND: np.array([*arm, *arm])}
+
+
+def test_it_goes_back_at_a_bounded_speed_and_gives_up_after_two_more_tries() -> None:
+    regrasp, first = Regrasp(HZ), seen(0.0, 0.04)
+    for miss in range(3):
+        said = [regrasp.next(seen(0.3, 0.001), first, 0.0, TICKS) for _ in range(3)]
+        assert said == ["act", "act", "back"], "a glance at shut fingers is not enough"
+        assert bool(regrasp.given_up) == (miss == 2)
+        way = regrasp.way_back(seen(0.3, 0.001), first, 16)
+        if miss < 2:
+            assert np.abs(way[:, :-1]).max() <= 0.6 / HZ + 1e-6 and way[:, -1].min() == np.float32(
+                0.08
+            )
+            assert way[:, :-1].sum(0) == pytest.approx(-0.3, abs=1e-6)
+            assert regrasp.next(seen(0.1, 0.08), first, 0.08, TICKS) == "back"
+            assert regrasp.next(seen(0.01, 0.08), first, 0.08, TICKS) == "look again"
+    assert not way[:, :-1].any() and "3 of 3 tries" in regrasp.given_up
+
+
+@pytest.mark.parametrize(("closes_in", "said"), [(0.005, "act"), (0.012, "back")])
+def test_an_object_is_lost_once_the_fingers_close_in_on_where_it_was(
+    closes_in: float, said: str
+) -> None:
+    regrasp, first = Regrasp(HZ), seen(0.0, 0.04)
+    for width in (0.08, 0.06, 0.03, 0.03, 0.03, 0.03, 0.03):
+        assert regrasp.next(seen(0.3, width), first, 0.0, TICKS) == "act"
+    assert regrasp.next(seen(0.3, 0.03 - closes_in), first, 0.0, TICKS) == said
+
+
+class Disturbed(PickPlace):
+    """The object goes elsewhere once the hand is over it."""
+
+    elsewhere = (0.5, 0.9)  # m
+    disturbed = False
+
+    def begin_tick(self) -> None:
+        where = self.data.joint("object").qpos
+        hand, _ = self.kinematics.forward(self.command)
+        if not self.disturbed and np.linalg.norm(hand[:2] - where[:2]) < 0.02 and hand[2] < 0.07:
+            where[:2], self.disturbed = self.elsewhere, True
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pushed", [False, True])
+def test_an_object_taken_away_is_told_and_one_pushed_aside_is_placed(
+    pushed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved = SavedPolicy(SHIPPED_POLICIES["pick-place"])
+    task = saved().env_config(PickPlaceConfig(max_seconds=20.0, as_deployed=True))
+    [spec] = trial_specs(replace(task, objects=("wooden_block",)), 1, 8803)
+    monkeypatch.setattr(Disturbed, "elsewhere", (0.55, 0.1) if pushed else (0.5, 0.9))
+    monkeypatch.setattr("touchgoal.policies.evaluation.evaluate.make_env", Disturbed)
+    trial = run_trial(task, saved, spec)
+    assert trial.success is pushed and trial.seconds < 15
+    assert trial.failure == ("" if pushed else GAVE_UP)
