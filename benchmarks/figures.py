@@ -35,6 +35,23 @@ def each_row(metrics: Metrics) -> str:
     return "; ".join(str(_rate(row["trials"])) for row in metrics["rows"])
 
 
+def looks(metrics: Metrics) -> str:
+    """Shares of looks that are right, refused, and confident and wrong, over all changes."""
+    rows = metrics["rows"]
+    counts = {kind: sum(row[kind] for row in rows) for kind in ("right", "refused", "wrong")}
+    total = sum(counts.values())
+    return ", ".join(f"{kind} {n / total:.0%}" for kind, n in counts.items()) + f" of {total}"
+
+
+def mended(metrics: Metrics) -> str:
+    """Success of every row, and how often the policy told that it had failed."""
+    rows = []
+    for row in metrics["rows"]:
+        told = sum(trial["failure"] == "gave up" for trial in row["trials"])
+        rows.append(f"{row['what'].split(', ')[1]} {_rate(row['trials'])}, {told} told")
+    return "; ".join(rows)
+
+
 def maze(metrics: Metrics, **names: str) -> str:
     """Success of closed-loop rows, by label and the row's name or a part that no other has."""
     found, rows = [], metrics["closed_loop"]

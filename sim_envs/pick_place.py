@@ -18,6 +18,7 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE, find_object, sample_body
 Hand = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, " j"]]
 """Joints (rad) of an arm for objects at these positions on the table (m, base frame)."""
 WORKSPACE = ((0.40, 0.60), (-0.20, 0.20))  # m, where objects start and goals lie, base frame
+_GONE = 0.5, 0.9  # m, a place beside the table
 _LIFTED = 0.03  # m above rest that counts as picked up
 _MOST_MISSES = 200  # draws too near to another place, after which all places are drawn again
 _APART = 0.12  # m at least between objects, and between start and goal
@@ -146,6 +147,20 @@ class PickPlace(FrankaTactileEnv):
             angle = self.np_random.uniform(-np.pi, np.pi)
             away = self.config.nudge * np.array([np.cos(angle), np.sin(angle)])
             self.data.joint("object").qpos[:2] += away
+        if self.config.interference and not self._interfered:
+            self._interfere(self.config.interference == "taken")
+
+    def _interfere(self, taken: bool) -> None:
+        """Take the object away, or knock it out of the hand, once the time has come."""
+        joint, (hand, _) = self.data.joint("object"), self.kinematics.forward(self.command)
+        over = np.linalg.norm(hand[:2] - joint.qpos[:2]) < 0.02 and hand[2] < 0.07
+        lifted = joint.qpos[2] > self.start[2] + 0.05
+        if not (over if taken else lifted):
+            return
+        angle, self._interfered = self.np_random.uniform(-np.pi, np.pi), True
+        aside = joint.qpos[:2] + 0.07 * np.array([np.cos(angle), np.sin(angle)])
+        joint.qpos[:2] = _GONE if taken else np.clip(aside, *np.array(WORKSPACE).T)
+        joint.qvel[:] = 0
 
     def _let_settle(self) -> None:
         super()._let_settle()
@@ -160,6 +175,7 @@ class PickPlace(FrankaTactileEnv):
         self.start = self.start_of("object")
         self._initial_distance = max(self._tcp_distance(self.start[:3]), 1e-3)
         self._still_ticks, self._lifted, self._put_down = 0, False, False
+        self._interfered = False
 
     def _info(self, progress: float, success: bool) -> dict[str, Any]:
         return super()._info(progress, success) | {ft.TRUTH_START: self.start.copy()}

@@ -1,6 +1,7 @@
 """A hand that closes on nothing, or loses its object, goes back and looks again; then it says that it failed."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.evaluation.evaluate import GAVE_UP, run_trial, trial_specs
 from touchgoal.policies.regrasp import Regrasp
 from touchgoal.sim_envs.config import PickPlaceConfig
-from touchgoal.sim_envs.pick_place import PickPlace
 
 HZ, TICKS = 20.0, 2
 
@@ -48,29 +48,15 @@ def test_an_object_is_lost_once_the_fingers_close_in_on_where_it_was(
     assert regrasp.next(seen(0.3, 0.03 - closes_in), first, 0.0, TICKS) == said
 
 
-class Disturbed(PickPlace):
-    """The object goes elsewhere once the hand is over it."""
-
-    elsewhere = (0.5, 0.9)  # m
-    disturbed = False
-
-    def begin_tick(self) -> None:
-        where = self.data.joint("object").qpos
-        hand, _ = self.kinematics.forward(self.command)
-        if not self.disturbed and np.linalg.norm(hand[:2] - where[:2]) < 0.02 and hand[2] < 0.07:
-            where[:2], self.disturbed = self.elsewhere, True
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("pushed", [False, True])
-def test_an_object_taken_away_is_told_and_one_pushed_aside_is_placed(
-    pushed: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("interference", "mended"), [("taken", False), ("knocked", True)])
+def test_an_object_taken_away_is_told_and_one_knocked_out_of_the_hand_is_placed(
+    interference: Literal["taken", "knocked"], mended: bool
 ) -> None:
     saved = SavedPolicy(SHIPPED_POLICIES["pick-place"])
-    task = saved().env_config(PickPlaceConfig(max_seconds=20.0, as_deployed=True))
-    [spec] = trial_specs(replace(task, objects=("wooden_block",)), 1, 8803)
-    monkeypatch.setattr(Disturbed, "elsewhere", (0.55, 0.1) if pushed else (0.5, 0.9))
-    monkeypatch.setattr("touchgoal.policies.evaluation.evaluate.make_env", Disturbed)
+    task = PickPlaceConfig(objects=("wooden_block",), max_seconds=20.0, as_deployed=True)
+    task = saved().env_config(replace(task, interference=interference))
+    [spec] = trial_specs(task, 1, 8803)
     trial = run_trial(task, saved, spec)
-    assert trial.success is pushed and trial.seconds < 15
-    assert trial.failure == ("" if pushed else GAVE_UP)
+    assert trial.success is mended and trial.seconds < 15
+    assert trial.failure == ("" if mended else GAVE_UP)

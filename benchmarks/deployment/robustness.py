@@ -35,6 +35,8 @@ _CHANGES: dict[SimulatedTask, dict[str, dict[str, Any]]] = {
         "size x1.2": {"size_factor": 1.2},
         "friction x0.5": {"friction_factor": 0.5},
         "object moved 2 cm after a second": {"nudge": 0.02},
+        "object taken away": {"interference": "taken", "max_seconds": 24.0},
+        "object knocked out of the hand": {"interference": "knocked", "max_seconds": 24.0},
         "camera turned 5 degrees up": {"surroundings": Surroundings(camera_turn=(0.0, 5.0))},
         "camera turned 5 degrees aside": {"surroundings": Surroundings(camera_turn=(5.0, 0.0))},
         "camera moved 2 cm aside": {"surroundings": Surroundings(camera_shift=(0.0, 0.02, 0.0))},

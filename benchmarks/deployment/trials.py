@@ -11,7 +11,7 @@ from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.policies.by_name import choose_policy
 from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy
-from touchgoal.policies.evaluation.evaluate import REFUSED, Evaluation, evaluate
+from touchgoal.policies.evaluation.evaluate import GAVE_UP, REFUSED, Evaluation, evaluate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import (
@@ -88,4 +88,6 @@ def table_row(what: str, result: Evaluation) -> str:
     peak = [trial.peak_force for trial in result.trials]
     force = f"{np.mean(peak):>19.1f}{np.std(peak):>6.1f}{max(peak):>6.1f}"
     refused = sum(trial.failure == REFUSED for trial in result.trials)
-    return f"{what:<46}{result!s:<24}{force}" + f"  {refused} refused" * bool(refused)
+    gave_up = sum(trial.failure == GAVE_UP for trial in result.trials)
+    told = [f"  {n} {how}" for n, how in ((refused, REFUSED), (gave_up, GAVE_UP)) if n]
+    return "".join([f"{what:<46}{result!s:<24}{force}", *told])
