@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.deployment import first_look as first_look_benchmark
+from benchmarks.deployment.first_look import Config
 from touchgoal.control import features as ft
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_pose_estimator
 from touchgoal.policies.perception.usual_view import UsualView
-from touchgoal.runtime.errors import RefusedError
+from touchgoal.runtime.errors import RefusedError, UserError
 from touchgoal.sim_envs.config import USUAL_CAMERA, CameraPlacement, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.surroundings import USUAL, Surroundings
@@ -71,6 +73,14 @@ def test_a_calibrated_camera_that_stands_elsewhere_finds_object_and_disc(
     except RefusedError:
         return
     assert np.linalg.norm(off[:2]) > 0.01
+
+
+def test_benchmark_first_look(capsys: pytest.CaptureFixture) -> None:
+    changes = ["unchanged", "lens of 60 degrees", "blue table", "upper half covered"]
+    found = first_look_benchmark.run(Config(changes=tuple(changes), looks=2, workers=1))["rows"]
+    assert [row["right"] for row in found] == [2, 2, 0, 0] and found[2]["refused"] == 2
+    with pytest.raises(UserError, match="no change 'tablecloth'"):
+        first_look_benchmark.run(Config(changes=("tablecloth",)))
 
 
 def test_a_camera_that_is_not_where_it_was_calibrated_is_told() -> None:

@@ -45,6 +45,8 @@ class Config(BenchmarkOptions):
 
     estimator: Path = SHIPPED_POLICIES["pick-place"] / ESTIMATOR
     """Folder of a pose estimator."""
+    changes: tuple[str, ...] = ()
+    """Changes to try, such as "blue table"; default: all."""
     looks: Count = 15
     """Looks under each change, at scenes drawn anew."""
     seed: Seed = seeds.POLICY_TEST.start + 300_000
@@ -166,7 +168,9 @@ class _Changed(PickPlace):
 
 def run(config: Config) -> dict[str, Any]:
     """Look under every change, and return the table."""
-    jobs = list(CHANGES)
+    jobs = list(config.changes or CHANGES)
+    if unknown := set(jobs) - set(CHANGES):
+        raise UserError(f"there is no change '{unknown.pop()}'; choose from: {', '.join(CHANGES)}")
     with parallel_map(partial(_look, config), jobs, config.workers) as results:
         found = dict(zip(jobs, track(results, "looking", "change", total=len(jobs)), strict=True))
     lines = [f"{'':<40}{'right':>6}{'refused':>9}{'wrong':>7}{'object, disc mm (median)':>28}"]
