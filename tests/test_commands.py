@@ -97,6 +97,9 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert frames.shape[1:] == (264, 720, 3) and fps == 10
     printed = capsys.readouterr().out
     assert "fused" in printed and str(tmp_path / "curves.png") in printed
+    assert (
+        "sees and feels alone, says: " in printed and "says: success" not in printed
+    )  # it is cut short
 
 
 def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -93,7 +93,7 @@ def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.Mo
 
     def look(*_: object) -> Look:
         start = torch.tensor([[now["x"], 0, 0, 1, 0, 0.3, 0.3]])
-        return Look(start, torch.full((1, 2), now["sure"]), torch.ones(1), {})
+        return Look(start, torch.full((1, 2), now["sure"]), torch.ones(1), {}, torch.zeros(1, 2))
 
     monkeypatch.setattr(PoseEstimator, "look", look)
     gel = np.full((120, 160, 3), 90, np.uint8)

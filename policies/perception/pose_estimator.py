@@ -24,6 +24,7 @@ _TCP = ft.FEATURES[ft.TCP_POSE].shape[0]
 _PATCH = 4  # px between two cells of a crop
 _CELL = 8  # px between two cells of a finder's map
 _PEAK = 1.5  # cells around a map's maximum over which the place is averaged
+_APART = 3.0  # cells between a place and the next one
 # Centre of the first cell, px: that of the 8 pixels of its patch, which begin at -2.
 _FIRST = 1.5
 _BRIGHTNESS, _MOST_GAIN = 110.0, 6.0  # grey levels of 255, the mean of the usual image
@@ -42,6 +43,8 @@ class Look:
     # Length of (cos, sin) of twice the yaw: 1 if sure, less where two yaws are as likely.
     turned: Float[Tensor, " b"]
     places: Places
+    # share of the scores near the likeliest other place of the object, and of the goal
+    second: Float[Tensor, "b 2"]
 
     @property
     def sureness(self) -> tuple[float, float, float]:
@@ -95,10 +98,10 @@ class PoseEstimator(nn.Module):
         """Find object and goal in evenly lit images; `scene` may be of the episode's first images."""
         scores = self.scores(lit, words)
         found = {key: _find(scores[key], box) for key, box in self.config.crops}
-        places = {key: place for key, (place, _) in found.items()}
+        places = {key: place for key, (place, _, _) in found.items()}
         start = self.start_normalizer.inverse(self.scaled(lit, scene, places))
-        surest = torch.stack([share for _, share in found.values()]).amax(0)
-        return Look(start, surest, start[:, 3:5].norm(dim=1), places)
+        surest, second = (torch.stack([f[i] for f in found.values()]).amax(0) for i in (1, 2))
+        return Look(start, surest, start[:, 3:5].norm(dim=1), places, second)
 
     def scores(
         self, images: Images, words: Float[Tensor, "b d"]
@@ -192,15 +195,27 @@ def _centres(box: Box) -> Float[Tensor, "y x 2"]:
 
 def _find(
     scores: Float[Tensor, "b 2 y x"], box: Box
-) -> tuple[Float[Tensor, "b 2 2"], Float[Tensor, "b 2"]]:
-    """Return the places (px), the mean over the cells around the highest score, and their share."""
+) -> tuple[Float[Tensor, "b 2 2"], Float[Tensor, "b 2"], Float[Tensor, "b 2"]]:
+    """Return the places (px) around the highest scores, their share, and that of the next place.
+
+    The next place is that of the highest score apart from there.
+    """
     centres = _centres(box).to(scores).flatten(0, 1)
     scores = scores.flatten(2)
-    peak = centres[scores.argmax(2)]
-    near = (peak[:, :, None] - centres).norm(dim=-1) <= _PEAK * _CELL
     share = scores.softmax(2)
+    far = _distances(share, centres)
+    near = far <= _PEAK * _CELL
     place = scores.masked_fill(~near, -torch.inf).softmax(2) @ centres
-    return place, share.masked_fill(~near, 0).sum(2)
+    others = share.masked_fill(far <= _APART * _CELL, 0)
+    second = others.masked_fill(_distances(others, centres) > _PEAK * _CELL, 0).sum(2)
+    return place, share.masked_fill(~near, 0).sum(2), second
+
+
+def _distances(
+    share: Float[Tensor, "b 2 cells"], centres: Float[Tensor, "cells 2"]
+) -> Float[Tensor, "b 2 cells"]:
+    """Return the distance of each cell from the one with the highest share, px."""
+    return (centres[share.argmax(2)][:, :, None] - centres).norm(dim=-1)
 
 
 class _SpatialSoftmax(nn.Module):

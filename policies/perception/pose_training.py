@@ -230,8 +230,9 @@ def _look(
         lit = evenly_lit({key: images[some] for key, images in placements.images.items()})
         looks.append(estimator.look(lit, chosen, estimator.scene(lit, placements.tcp[some])))
     joined = (torch.cat([getattr(o, k) for o in looks]) for k in ("start", "found", "turned"))
+    second = torch.cat([o.second for o in looks])
     places = {key: torch.cat([o.places[key] for o in looks]) for key in looks[0].places}
-    return Look(*joined, places)
+    return Look(*joined, places, second)
 
 
 def _yaw_error(predicted: Float[Tensor, "n 7"], true: Float[Tensor, "n 7"]) -> Float[Tensor, " n"]:
