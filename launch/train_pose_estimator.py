@@ -67,7 +67,7 @@ def main(config: Config) -> None:
     first = seeds.POSE_VALIDATION.start
     usual = render_placements(env, few, 10, first + few, config.workers, Variety(0, 0.5, 0, 0))
     sure, refused = pose_training.fit_sure(network, usual)
-    network.config = replace(network.config, sure=sure)
+    network.config = replace(network.config, sure=sure, second=pose_training.SECOND)
     print(f"refused: {refused['good']:.1%} of good estimates, {refused['bad']:.0%} of bad ones")
     errors = {}
     for where, variety in (

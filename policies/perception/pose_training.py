@@ -22,6 +22,7 @@ from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
 _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose counts linearly
 _FINDER_ROWS = 4  # the first look, which learns faster, is trained on one of so many samples
 _WORD_NOISE = 0.015  # standard deviation of each number of a sentence's embedding of length 1
+SECOND = 0.04  # see `PoseEstimatorConfig.second`
 _PLACE_NOISE = 8.0  # px by which crops are off in training: a cell of the first look
 _PIXEL_NOISE = 4  # largest change of a pixel by simulated camera noise, grey levels
 _BATCH = 64

@@ -29,9 +29,6 @@ _FARTHEST = 4.0  # standard deviations of the hand's start in training
 # m. A camera farther from the training's than there is not what the network knows; else its places lie
 # at most the second distance from the image's: a degree of a calibration's error is 16 mm.
 _ELSEWHERE, _APART = 0.03, 0.04
-# Share of the first look at another place than the object's: at most 0.02 with one such object in 24 scenes,
-# at least 0.06 with two or three in 24.
-_AMBIGUOUS = 0.04
 _PLACES = [0, 1, 5, 6]  # x and y of the object and of the goal in `features.TRUTH_START`
 _OBJECT = 5  # numbers of `features.TRUTH_START` on the object
 _ASKED = ("where the object is", "where the disc is", "how the object is turned")
@@ -107,7 +104,7 @@ class StateEstimator:
                     f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): put "
                     "objects and disc in view, and say which one is meant (--target)"
                 )
-        if look.second[0, 0] > _AMBIGUOUS:
+        if look.second[0, 0] > self.pose_estimator.config.second:
             meant = f"'{self.target}'" if self.target else "what is meant"
             raise RefusedError(
                 f"several objects may be {meant}: say which one, so that it fits no other (--target)"
