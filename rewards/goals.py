@@ -136,7 +136,11 @@ class EpisodeEnd:
     def __str__(self) -> str:
         return f"episode:{self.root}#{self.index}"
 
-    def read(self, keys: Sequence[str], also: Sequence[str] = ()) -> Episode:
+    def ends(self) -> list["EpisodeEnd"]:
+        """Return itself, as a `Bank` returns several."""
+        return [self]
+
+    def read(self, keys: Sequence[str] = (), also: Sequence[str] = ()) -> Episode:
         """Return the first frames (for the background of touch) and, last, the last frame.
 
         The simulator's contact, the wrench and `also` are added where they are recorded. UserError: no
@@ -355,10 +359,9 @@ def check_goals(goals: Goals, inputs: Inputs) -> None:
             frame_index(spec, inputs.length, inputs.name)
         if isinstance(spec, GoalImage):
             spec.read()
-        if isinstance(spec, EpisodeEnd):
-            spec.read([inputs.camera or FRONT] if modality == "image" else inputs.sides)
-        if isinstance(spec, Bank):
-            spec.ends()
+        if isinstance(spec, EpisodeEnd | Bank):
+            read = [inputs.camera or FRONT] if modality == "image" else inputs.sides
+            spec.ends()[0].read(read)
         if isinstance(spec, GoalFile) and not spec.path.is_file():
             raise UserError(f"goal '{spec}' does not exist: write one with fit-normalizer")
 

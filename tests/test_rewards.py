@@ -221,7 +221,9 @@ def test_a_normalizer_of_other_embeddings_is_refused(what: str) -> None:
     good = embedded("good")
     normalizer = replace_text(fit_scene([good, replace(good)], ["image", "tactile"]))
     other = replace(good, made_with=replace(MADE, **{what: "z"}))
-    with pytest.raises(UserError, match=f"does not apply: it was fitted with the .*{what}, not z"):
+    with pytest.raises(
+        UserError, match=f"does not apply: .* its {what} is {getattr(MADE, what)}, not z"
+    ):
         compute_curves(other, goal_of(good), normalizer)
 
 
