@@ -124,9 +124,7 @@ def find_peaks(d: Curve, eps: float) -> Int[np.ndarray, " peaks"]:
     """Return the frames of the local maxima whose prominence is at least eps.
 
     A run of equal values is one sample (reported at its middle frame), and the first and the last
-    run are no peaks. The prominence of a peak is its height above the higher of two bases, each
-    the lowest value between the peak and the nearest strictly higher value on that side, or the
-    curve's end (the topographic definition, of scipy.signal.peak_prominences).
+    run are no peaks. Prominence is that of scipy.signal.peak_prominences.
     """
     return signal.find_peaks(d, prominence=eps)[0]
 

@@ -270,17 +270,15 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
     UserError: a goal, encoder or normalizer that does not fit the cell.
     """
     simulated = cell.arm == "sim" or bool(cell.task.twin)
-    cameras = tuple(key for key in ft.CAMERAS if key.removeprefix(ft.IMAGE_PREFIX) in cell.cameras)
-    inputs = Inputs(
-        name="the cell",
-        camera=ft.FRONT if ft.FRONT in cameras else None,
-        sides=ft.TACTILE if cell.fingertips is not None else (),
-        sensor=cell.sensor,
-        scene=f"simulated {cell.task.simulated}" if simulated else REAL_SCENE,
-        cameras=cameras,
-        task=cell.task.instruction or cell.task.name,
-    )
+    keys = {f"{ft.IMAGE_PREFIX}{name}" for name in cell.cameras}
     task, folder = cell.task, Path(cell.task.judge)
+    inputs = Inputs.of(
+        "the cell",
+        keys | set(ft.TACTILE if cell.fingertips is not None else ()),
+        sensor=cell.sensor,
+        scene=f"simulated {task.simulated}" if simulated else REAL_SCENE,
+        task=task.instruction or task.name,
+    )
     if task.judge:
         reward = judged_reward(folder, task.encoder or None)
     else:

@@ -7,7 +7,7 @@ from typing import overload
 import numpy as np
 import torch
 
-from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE
+from touchgoal.control.features import CONTROL_HZ, FRONT
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.preprocess import check_images
@@ -213,17 +213,19 @@ class Reward:
         """
         key = inputs.camera, inputs.sensor, *inputs.sides[:1], str(parts)
         if key not in self._embedders:
-            _check_device(self._device)
+            try:
+                torch.zeros(1, device=self._device)
+            except (RuntimeError, AssertionError, NotImplementedError) as error:
+                why = f"cannot be used here ({str(error).splitlines()[0]})"
+                raise UserError(f"--device {self._device} {why}: give cpu") from error
             touch, towers = self._touch_encoder(inputs)[0], self._towers
             if isinstance(towers, str) or towers is None:
-                towers = self._load_towers(towers or (touch and touch.towers) or OfflineTowers.name)
+                name = towers or (touch and touch.towers) or OfflineTowers.name
+                if name not in self._loaded_towers:
+                    self._loaded_towers[name] = load_towers(name, self._device)
+                towers = self._loaded_towers[name]
             self._embedders[key] = EpisodeEmbedder(towers, touch, inputs.camera or "", parts)
         return self._embedders[key]
-
-    def _load_towers(self, name: str) -> Towers:
-        if name not in self._loaded_towers:
-            self._loaded_towers[name] = load_towers(name, self._device)
-        return self._loaded_towers[name]
 
     def _touch_encoder(self, inputs: Inputs) -> tuple[AnyTouchEncoder | None, Path | None]:
         """Return the touch encoder, and the folder that may hold a normalizer."""
@@ -271,12 +273,8 @@ class Reward:
         if found is None or reason:
             if given is not None:
                 raise UserError(f"{reason}; {REMEDY}")
-            return (
-                None,
-                None,
-                f"raw cosine distances, for {reason}; to normalise them: {_FIT}",
-                None,
-            )
+            note = f"raw cosine distances, for {reason}; to normalise them: {_FIT}"
+            return None, None, note, None
         value = beside = None
         if folder is not None and VALUE_FORMAT.weights_path(folder).is_file():
             value, beside = Value.load(folder), ", with the value beside it"
@@ -309,20 +307,17 @@ class Reward:
         sensor = episode.meta.get("sensor")
         if sensor is None and scene == _ARRAYS and self._encoder is None:
             sensor = pretrained.DEFAULT_ENCODER.name
-        inputs = Inputs(
-            name="this trajectory",
-            camera=camera if camera in episode.frames else None,
-            sides=tuple(key for key in TACTILE if key in episode.frames),
+        inputs = Inputs.of(
+            "this trajectory",
+            episode.frames,
+            camera,
             sensor=None if sensor is None else str(sensor),
             scene=scene,
             length=len(episode),
-            cameras=tuple(key for key in CAMERAS if key in episode.frames),
             task=episode.task,
         )
-        goals = [
-            goal.beside(episode.frames) if isinstance(goal, TouchArrays) else goal
-            for goal in self.goals
-        ]
+        frames = episode.frames
+        goals = [g.beside(frames) if isinstance(g, TouchArrays) else g for g in self.goals]
         prepared = self.prepare(inputs, goals)
         return prepared, prepared.embedder.embed_episode(episode, fps, inputs.name)
 
@@ -344,14 +339,6 @@ def _as_episode(
     if min(len(frames) for frames in given.values()) < 2:
         raise UserError("a curve needs at least 2 frames")
     return Episode({names[name]: frames for name, frames in given.items()}, "")
-
-
-def _check_device(device: str) -> None:
-    try:
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"--device {device} cannot be used here ({reason}): give cpu") from error
 
 
 def _shipped_for(inputs: Inputs) -> Path:

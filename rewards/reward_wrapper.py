@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE, Observation
+from touchgoal.control.features import CONTROL_HZ, Observation
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.online import CostMeter, judged_reward
 from touchgoal.rewards.reward import Reward
@@ -21,15 +21,9 @@ def inputs_of(env: gym.Env) -> Inputs:
     space = env.observation_space
     keys = set(space) if isinstance(space, gym.spaces.Dict) else set()
     sensor, task = (getattr(env.unwrapped, name, None) for name in ("sensor", "task"))
-    return Inputs(
-        name="the environment",
-        camera=FRONT if FRONT in keys else None,
-        sides=tuple(key for key in TACTILE if key in keys),
-        sensor=getattr(sensor, "name", None),
-        scene=f"simulated {task}" if task else "unknown",
-        cameras=tuple(key for key in CAMERAS if key in keys),
-        task=str(task or ""),
-    )
+    scene, task = f"simulated {task}" if task else "unknown", str(task or "")
+    sensor = getattr(sensor, "name", None)
+    return Inputs.of("the environment", keys, sensor=sensor, scene=scene, task=task)
 
 
 class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):

@@ -88,8 +88,7 @@ class EpisodeEmbedder:
             parts: embed everything that the parts of a cost need: both cameras, their maps, and the
                 contact of the fingertips; else one camera and touch.
         """
-        self._towers = towers
-        self.encoder = encoder
+        self._towers, self.encoder = towers, encoder
         self._aligned = encoder if encoder is not None and encoder.towers else None
         self.knows_words = self._aligned is not None  # touch can be compared with sentences
         self.camera, self.parts = camera, parts
@@ -218,14 +217,15 @@ class EpisodeEmbedder:
     def embed_cameras(self, frames: Frames) -> Features:
         """Return image, and with parts the pooled features and map of each camera."""
         if not self.parts:
-            return {IMAGE: self._embed_images(frames[self.camera])} if self.camera in frames else {}
+            images = frames.get(self.camera)
+            return {} if images is None else {IMAGE: _unit(self._towers.embed_images(images))}
         features: dict[str, np.ndarray] = {}
         for key in dict.fromkeys((*CAMERAS, self.camera)):
             if key in frames and isinstance(self._towers, OfflineTowers):
                 pooled, features[map_name(key)] = self._towers.embed_with_maps(frames[key])
                 features[camera_name(key)] = _unit(pooled)
             elif key in frames:
-                features[camera_name(key)] = self._embed_images(frames[key])
+                features[camera_name(key)] = _unit(self._towers.embed_images(frames[key]))
         if self.camera in frames:
             features[IMAGE] = features[camera_name(self.camera)]
         return features
@@ -248,9 +248,6 @@ class EpisodeEmbedder:
         """Return unit embeddings of sentences on how touch feels, comparable with `embed_touch`."""
         assert self._aligned is not None  # without it no modality takes a sentence
         return self._aligned.embed_text_goal(list(sentences), self._towers)
-
-    def _embed_images(self, frames: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, "n d"]:
-        return _unit(self._towers.embed_images(frames))
 
     def _embed_goal(
         self, modality: Modality, spec: GoalSpec, own: EmbeddedEpisode

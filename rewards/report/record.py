@@ -60,7 +60,7 @@ class Record:
     facts: Facts
     columns: dict[str, Float[np.ndarray, " n"]]  # values per frame
     sheets: dict[str, UInt8[np.ndarray, " bytes"]]  # JPEG of each camera and fingertip
-    thumb: UInt8[np.ndarray, " bytes"]  # JPEG of the last frame
+    thumb: UInt8[np.ndarray, " thumb"]  # JPEG of the last frame
 
     @property
     def costs(self) -> dict[str, Float[np.ndarray, " n"]]:

@@ -14,12 +14,7 @@ from touchgoal.rewards.report.frame_table import PROGRESS, write_frames, write_p
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.plot import plot
 from touchgoal.rewards.report.record import Record, columns_of
-from touchgoal.rewards.report.tables import (
-    MOST_CURVES,
-    ends_table,
-    metrics_table,
-    outcome_table,
-)
+from touchgoal.rewards.report.tables import MOST_CURVES, ends_table, metrics_table, outcome_table
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.json_file import write_json
 

@@ -67,10 +67,8 @@ def open_episodes(
     chosen = list(index or range(len(episodes)))
     touch = tuple(key for key in TACTILE if with_touch and key in episodes.features)
     camera = _find_camera(episodes, camera, bool(touch))
-    cameras = tuple(key for key in dict.fromkeys((*CAMERAS, camera)) if key in episodes.features)
-    read = tuple(
-        key for key in (*cameras, *touch, TRUTH_CONTACT, *ARM.values()) if key in episodes.features
-    )
+    wanted = dict.fromkeys((*CAMERAS, camera, *touch, TRUTH_CONTACT, *ARM.values()))
+    read = tuple(key for key in wanted if key in episodes.features)
     offsets, lengths = [0, *accumulate(episodes.lengths)], episodes.lengths
     found = [
         EpisodeTrajectory(
@@ -102,14 +100,13 @@ def open_episodes(
     if not sound:
         raise UserError(broken[0].reason)
     shortest = min(sound, key=lambda t: t.length)
-    inputs = Inputs(
-        name=shortest.source,
-        camera=camera if camera in episodes.features else None,
-        sides=touch,
+    inputs = Inputs.of(
+        shortest.source,
+        read,
+        camera,
         sensor=next(iter(sensors), None),
         scene=scene_of(episodes.features),
         length=shortest.length,
-        cameras=cameras,
         task=next(iter(tasks)) if len(tasks) == 1 else "",
     )
     return Source(inputs, sound, broken)

@@ -111,15 +111,9 @@ def open_videos(
             f"{_words(keys)}: measure them apart, or give each the same videos"
         )
     shortest = min(opened, key=lambda trajectory: trajectory.length)
-    inputs = Inputs(
-        name=shortest.source,
-        camera=camera if camera in keys else None,
-        sides=tuple(key for key in ft.TACTILE if key in keys),
-        scene="a plain video",
-        length=shortest.length,
-        cameras=tuple(key for key in ft.CAMERAS if key in keys),
-    )
-    about = f"{shortest.length} frames at {shortest.fps:g} per second"
+    length = shortest.length
+    inputs = Inputs.of(shortest.source, keys, camera, scene="a plain video", length=length)
+    about = f"{length} frames at {shortest.fps:g} per second"
     if len(opened) > 1:
         about = f"{len(opened):,} trajectories, {offset:,} frames"
     return Source(inputs, opened, skipped, f"{path.name}: {about}, {_words(keys)}")
