@@ -1,10 +1,11 @@
 """Contact of each fingertip frame by frame: whether it touches, how hard, where, and slip."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from touchgoal.control.arrays import Image
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.force import contact_centre, estimate_force
 from touchgoal.control.tactile.sensor_calibration import load
@@ -29,13 +30,14 @@ class ContactReader:
         """Take the sensor model, None for an unknown sensor, frames without contact, and the rate."""
         self._sensor, self._slip = sensor, SlipMeter(fps)
         self._depth: DepthEstimator | None = None
-        self._pitch, self._size = 0.0, untouched.shape[2:0:-1]
+        self._pitch, size = 0.0, untouched.shape[2:0:-1]
         if sensor is not None:
             calibration = load(sensor.sensor_file)
             if not sensor.images_only:
                 self._depth = DepthEstimator(calibration, _CELL)
             self._pitch = calibration.pixel_pitch
-            self._size = calibration.background.shape[1::-1]
+            size = calibration.background.shape[1::-1]
+        self._resized = partial(cv2.resize, dsize=size, interpolation=cv2.INTER_AREA)
         self._detector = contact_detector(np.stack([self._resized(f) for f in untouched]))
 
     def read(self, frames: UInt8[np.ndarray, "n h w 3"]) -> dict[str, np.ndarray]:
@@ -59,11 +61,6 @@ class ContactReader:
         numbers = {"force": force, "centre": centre, "slip": slip} if self._depth else {}
         readings = {name: np.array(values, np.float32) for name, values in numbers.items()}
         return {"held": np.array(held)} | readings
-
-    def _resized(self, frame: Image) -> Image:
-        if frame.shape[1::-1] == self._size:
-            return frame
-        return cv2.resize(frame, self._size, interpolation=cv2.INTER_AREA)
 
 
 class SlipMeter:
