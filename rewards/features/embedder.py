@@ -152,8 +152,8 @@ class EpisodeEmbedder:
         contact = Contact(None, "no touch")
         if touching is not None:
             frames = np.flatnonzero(touching.any(axis=1))
-            source_of = "detected" if truth is None else "truth"
-            contact = Contact(int(frames[0]) if len(frames) else None, source_of)
+            first_frame = int(frames[0]) if len(frames) else None
+            contact = Contact(first_frame, "detected" if truth is None else "truth")
         if not self.parts:
             features.pop("held", None)
         return replace(pieces[0], features=features, contact=contact).with_facts(first.meta)
