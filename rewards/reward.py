@@ -103,11 +103,8 @@ class Reward:
         self._folder: Path | None = None  # of the given normalizer
         self._name = "the given normalizer"
         if isinstance(normalizer, str | Path) and str(normalizer) not in ("encoder", "none"):
-            self._normalizer, self._name = (
-                DistanceNormalizer.load(Path(normalizer)),
-                str(normalizer),
-            )
-            self._folder = Path(normalizer).parent
+            self._normalizer = DistanceNormalizer.load(Path(normalizer))
+            self._name, self._folder = str(normalizer), Path(normalizer).parent
         self._encoders: dict[str | None, tuple[AnyTouchEncoder, Path | None]] = {}  # by sensor
         self._loaded_towers: dict[str, Towers] = {}  # by name
         self._embedders: dict[tuple[str | None, ...], EpisodeEmbedder] = {}
