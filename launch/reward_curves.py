@@ -72,13 +72,7 @@ def main(config: Config) -> None:
     from touchgoal.episodes.keys import parse_keys
     from touchgoal.rewards.audit import audit_trajectories
     from touchgoal.rewards.goals import Bank, OwnFrame, parse_goal
-    from touchgoal.rewards.measure import (
-        EncoderOptions,
-        Measurement,
-        embed_here,
-        embed_on_ray,
-        write_skipped,
-    )
+    from touchgoal.rewards.measure import Measurement, embed_here, embed_on_ray, write_skipped
     from touchgoal.rewards.report.frame_table import FRAMES
     from touchgoal.rewards.report.page import PAGE
     from touchgoal.rewards.report.report import report_all
@@ -120,8 +114,8 @@ def main(config: Config) -> None:
     measurement = Measurement(source.trajectories, rewards, out, config.plots)
     embed = partial(embed_here, embedder=first.embedder)
     if config.ray is not None:
-        options = EncoderOptions(source.inputs, config.encoder, config.towers, first.embedder.parts)
-        embed = partial(embed_on_ray, options=options, address=config.ray)
+        encoders = source.inputs, config.encoder, config.towers, first.embedder.parts
+        embed = partial(embed_on_ray, address=config.ray, encoders=encoders)
     total = len(source.trajectories) + len(source.skipped)
     if done := len(measurement.records):
         print(f"{done:,} of {total:,} trajectories are measured in {out}")

@@ -64,26 +64,22 @@ class AuditTable:
     @property
     def mattered(self) -> bool:
         """Whether the order of the cost gets worse when the touch is shuffled in time."""
-        row = self._row("order", "shuffled")
-        return row is not None and row.high < 0
+        return self._row("order", "shuffled").high < 0
 
     @property
     def verdict(self) -> str:
         """The verdict in words."""
-        row = self._row("order", "shuffled")
-        if row is None or row.low != row.low:
+        row, other = self._row("order", "shuffled"), self._row("last cost", "another's")
+        if np.isnan(row.low):
             return "touch use cannot be judged: the order of the cost is undefined"
         if not self.mattered:
             return (
                 f"no sign that touch mattered: shuffled in time, the order changes by {row.change}"
             )
-        other = self._row("last cost", "another's")
-        swapped = "with another episode's touch the last cost is no higher"
-        if other is not None and other.low > 0:
-            rise = other.replaced - other.real
-            swapped = f"with another episode's touch the last cost is {rise:.2f} higher"
+        rise = f"{other.replaced - other.real:.2f}" if other.low > 0 else "no"
         return (
-            f"touch mattered: shuffled in time, the cost's order changes by {row.change}; {swapped}"
+            f"touch mattered: shuffled in time, the cost's order changes by {row.change}; "
+            f"with another episode's touch the last cost is {rise} higher"
         )
 
     @property
@@ -98,10 +94,8 @@ class AuditTable:
             lines.append(f"{r.metric:<11}{r.replacement:<11}{values}")
         return "\n".join([*lines, self.verdict])
 
-    def _row(self, metric: str, replacement: str) -> AuditRow | None:
-        return next(
-            (r for r in self.rows if (r.metric, r.replacement) == (metric, replacement)), None
-        )
+    def _row(self, metric: str, replacement: str) -> AuditRow:
+        return next(r for r in self.rows if (r.metric, r.replacement) == (metric, replacement))
 
 
 def audit_touch(
@@ -117,24 +111,29 @@ def audit_touch(
         goals: one per episode, from other episodes.
         measure: returns the curves of an episode to a goal.
     """
-    _check(episodes, goals)
+    if len(episodes) < 2:
+        raise UserError(f"an audit of touch needs at least two episodes, not {len(episodes)}")
+    for episode, goal in zip(episodes, goals, strict=True):
+        if TOUCH not in episode.features:
+            raise UserError(f"{episode.source} has no touch to audit: leave --audit out")
+        if goal.same_episode:
+            raise UserError(
+                f"the goal of {episode.source} is a frame of itself, so the audit of touch proves "
+                "nothing: give the end of another episode, or a bank of them"
+            )
     if FUSED not in measure(episodes[0], goals[0]).costs:
         raise UserError(
             "an audit of touch needs the fused cost: give a --normalizer with units, and leave --plain out"
         )
     real = _measured(episodes, goals, measure)
-    rng, rows = np.random.default_rng(0), []
-    replaced = {
-        name: _measured(
-            [_replace(name, episodes, k, rng) for k in range(len(episodes))], goals, measure
-        )
-        for name in REPLACEMENTS
-    }
+    rng, replaced = np.random.default_rng(0), {}
+    for name in REPLACEMENTS:
+        others = [_replace(name, episodes, k, rng) for k in range(len(episodes))]
+        replaced[name] = _measured(others, goals, measure)
     failed = np.array([e.success is False for e in episodes])
-    for metric, name in product(METRICS, REPLACEMENTS):
-        if metric == "AUC" and (failed.all() or not failed.any()):
-            continue
-        rows.append(_row(metric, name, real, replaced[name], failed))
+    metrics = [m for m in METRICS if m != "AUC" or 0 < failed.sum() < len(failed)]
+    pairs = product(metrics, REPLACEMENTS)
+    rows = [_row(metric, name, real, replaced[name], failed) for metric, name in pairs]
     return AuditTable(tuple(rows), len(episodes))
 
 
@@ -153,19 +152,6 @@ def audit_trajectories(
         return compute_curves(episode, goal, reward.normalizer, reward.value, plain=reward.plain)
 
     return audit_touch(embedded, goals, measure)
-
-
-def _check(episodes: Sequence[EmbeddedEpisode], goals: Sequence[EmbeddedGoal]) -> None:
-    if len(episodes) < 2:
-        raise UserError(f"an audit of touch needs at least two episodes, not {len(episodes)}")
-    for episode, goal in zip(episodes, goals, strict=True):
-        if TOUCH not in episode.features:
-            raise UserError(f"{episode.source} has no touch to audit: leave --audit out")
-        if goal.same_episode:
-            raise UserError(
-                f"the goal of {episode.source} is a frame of itself, so the audit of touch proves "
-                "nothing: give the end of another episode, or a bank of them"
-            )
 
 
 def _replace(

@@ -97,7 +97,7 @@ class Curves:
     @property
     def rewards(self) -> dict[str, Float[np.ndarray, " n"]]:
         """State reward -cost per frame, by name of the curve."""
-        return {name: state_reward(d) for name, d in self.costs.items()}
+        return {name: 0.0 - d for name, d in self.costs.items()}  # no negative zeros in the files
 
     def potential_rewards(self, gamma: float = GAMMA) -> dict[str, Float[np.ndarray, " n"]]:
         """Return the potential-based reward of the step into each frame, by name of the curve.
@@ -140,16 +140,10 @@ def reference_levels(names: Iterable[str], normalised: bool) -> list[tuple[float
     return [(0.0, "usual end"), (1.0, "usual start")] if normalised else []
 
 
-def state_reward(cost: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return r_t = -cost_t."""
-    return 0.0 - cost  # no negative zeros in the files
-
-
 def potential_reward(cost: Float[np.ndarray, " n"], gamma: float) -> Float[np.ndarray, " n"]:
     """Return F_t = gamma Phi_t - Phi_{t-1} with Phi = -cost, F_0 = 0 (Ng et al. 1999, equation 2).
 
     `gamma` is the discount per step. With gamma = 1 it sums to cost_0 - cost_T over any path.
     With a smaller gamma, standing still earns (1 - gamma) cost per step: more, farther from the goal.
     """
-    potential = state_reward(cost)
-    return np.concatenate([np.zeros(1), gamma * potential[1:] - potential[:-1]])
+    return np.concatenate([np.zeros(1), cost[:-1] - gamma * cost[1:]])

@@ -80,7 +80,13 @@ def make(
         if (touch, encoder) != ("image", None):
             raise UserError("touch and encoder need for_rl=True")
         return env
-    return ForRL(_with_embeddings(env, encoder) if touch == "embedding" else env)
+    if touch == "embedding":
+        from touchgoal.encoders.embedded_observation import EmbeddedTouch
+        from touchgoal.encoders.pretrained import load_encoder, shipped_encoder_for
+
+        sensor = env.get_wrapper_attr("sensor").name
+        env = EmbeddedTouch(env, load_encoder(encoder or shipped_encoder_for(sensor), sensor))
+    return ForRL(env)
 
 
 def make_vec(task: str, num_envs: int, **options: Any) -> gym.vector.AsyncVectorEnv:
@@ -98,11 +104,3 @@ def _make_in_worker(task: str, options: dict[str, Any]) -> ForRL:
 
     torch.set_num_threads(1)  # the workers are themselves many
     return make(task, for_rl=True, **options)
-
-
-def _with_embeddings(env: gym.Env, encoder: str | Path | None) -> gym.Env:
-    from touchgoal.encoders.embedded_observation import EmbeddedTouch
-    from touchgoal.encoders.pretrained import load_encoder, shipped_encoder_for
-
-    sensor = env.get_wrapper_attr("sensor").name
-    return EmbeddedTouch(env, load_encoder(encoder or shipped_encoder_for(sensor), sensor))

@@ -9,23 +9,15 @@ Without touch, and with towers that were trained together (a CLIP), a sentence i
 import hashlib
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.features import (
-    FRONT,
-    TACTILE,
-    TACTILE_LEFT,
-    TACTILE_RIGHT,
-    TCP_POSE,
-    TRUTH_CONTACT,
-    WRENCH,
-)
+from touchgoal.control import features as ft
 from touchgoal.encoders.preprocess import check_images
 from touchgoal.encoders.towers.goal_sentence import check_goal_sentence
 from touchgoal.episodes.schema import Episode
@@ -54,6 +46,13 @@ class Inputs:
     length: int | None = None  # number of frames of the shortest; None if unknown
     cameras: tuple[str, ...] = ()  # keys of all cameras
     task: str = ""  # task in words, "" if unknown or if there are several
+
+    @classmethod
+    def of(cls, name: str, keys: Container[str], camera: str = ft.FRONT, **about: Any) -> "Inputs":
+        """Return what is known of observations with these keys; `about` has the other fields."""
+        sides = tuple(key for key in ft.TACTILE if key in keys)
+        cameras = tuple(key for key in dict.fromkeys((*ft.CAMERAS, camera)) if key in keys)
+        return cls(name, camera if camera in keys else None, sides, cameras=cameras, **about)
 
     @property
     def fitted_task(self) -> str:
@@ -124,7 +123,7 @@ class TouchArrays:
 
     def beside(self, frames: Mapping[str, np.ndarray]) -> "TouchArrays":
         """Take the background from a trajectory's frames; UserError: it has other fingertips."""
-        if self.images.keys() != {key for key in TACTILE if key in frames}:
+        if self.images.keys() != {key for key in ft.TACTILE if key in frames}:
             raise UserError("the goal's fingertips must be the trajectory's: left, right or both")
         return replace(self, backgrounds={k: touch_background(frames[k]) for k in self.images})
 
@@ -141,7 +140,11 @@ class EpisodeEnd:
     def __str__(self) -> str:
         return f"episode:{self.root}#{self.index}"
 
-    def read(self, keys: Sequence[str], also: Sequence[str] = ()) -> Episode:
+    def ends(self) -> list["EpisodeEnd"]:
+        """Return itself, as a `Bank` returns several."""
+        return [self]
+
+    def read(self, keys: Sequence[str] = (), also: Sequence[str] = ()) -> Episode:
         """Return the first frames (for the background of touch) and, last, the last frame.
 
         The simulator's contact, the wrench and `also` are added where they are recorded. UserError: no
@@ -153,7 +156,7 @@ class EpisodeEnd:
                 f"goal '{self}' does not exist: {self.root} has episodes 0 to {len(episodes) - 1}"
             )
         length = episodes.lengths[self.index]
-        wanted = dict.fromkeys((*also, TRUTH_CONTACT, WRENCH, TCP_POSE))
+        wanted = dict.fromkeys((*also, ft.TRUTH_CONTACT, ft.WRENCH, ft.TCP_POSE))
         more = [key for key in wanted if key in episodes.features and key not in keys]
         frames = [*range(min(START_FRAMES, length)), length - 1]
         return episodes.read(self.index, [*keys, *more], frames)
@@ -249,7 +252,7 @@ Goals = Mapping[Modality, GoalSpec]
 GoalLike = GoalSpec | str | int | np.ndarray | Mapping[str, np.ndarray]
 """A goal in a script; see `touchgoal.Reward`."""
 
-SIDES = {"left": TACTILE_LEFT, "right": TACTILE_RIGHT}
+SIDES = {"left": ft.TACTILE_LEFT, "right": ft.TACTILE_RIGHT}
 """Names of the fingertips in a script, and their keys."""
 
 
@@ -263,16 +266,14 @@ def parse_goal(text: str, keys: Mapping[str, str] | None = None) -> GoalSpec:
 
     UserError, with the forms: any other text.
     """
-    kind, _, value = text.strip().partition(":")
-    value = value.strip()
-    episode = re.fullmatch(r"(.+)#(\d+)", value)
+    kind, _, value = (part.strip() for part in text.partition(":"))
     if text.strip() == "last":
         return OwnFrame()
     if kind == "frame" and re.fullmatch(r"\d+", value):
         return OwnFrame(int(value))
     if kind == "image" and value:
         return GoalImage(Path(value))
-    if kind == "episode" and episode:
+    if kind == "episode" and (episode := re.fullmatch(r"(.+)#(\d+)", value)):
         return EpisodeEnd(Path(episode[1]), int(episode[2]), keys or {})
     if kind == "bank" and value:
         return Bank(Path(value), keys or {})
@@ -302,19 +303,15 @@ def goals_of_script(goal: GoalLike | Sequence[GoalLike]) -> list[GoalSpec]:
             r"\s*(frame|image|episode|bank|goal|text|force):", goal
         )
         return [parse_goal(goal) if known else Sentence(goal)]
-    if isinstance(goal, Mapping):
-        return _goals_of_arrays(goal)
-    return [spec for one in goal for spec in goals_of_script(one)]
-
-
-def _goals_of_arrays(goal: Mapping[str, np.ndarray]) -> list[GoalSpec]:
+    if not isinstance(goal, Mapping):
+        return [spec for one in goal for spec in goals_of_script(one)]
     for name, image in goal.items():
         if name != "image" and name not in SIDES:
             raise UserError(f"a goal has no '{name}': give image, left, right or several of them")
         check_images(f"the goal's {name}", image, ndim=(3,))
     touch = {SIDES[name]: image for name, image in goal.items() if name in SIDES}
-    specs: list[GoalSpec] = [GoalImage(goal["image"])] if "image" in goal else []
-    return [*specs, *([TouchArrays(touch)] if touch else [])]
+    images: list[GoalSpec] = [GoalImage(goal["image"])] if "image" in goal else []
+    return [*images, *([TouchArrays(touch)] if touch else [])]
 
 
 def assign_goals(
@@ -332,21 +329,24 @@ def assign_goals(
         wanted: list[Modality] = [m for m in spec.modalities if m in available]
         if isinstance(spec, Sentence) and not wanted:
             if not image_words:
-                raise UserError(_no_words(spec))
+                raise UserError(
+                    f"goal '{spec}' is a sentence, and there is no touch to compare it with; the "
+                    "offline image tower knows no words: give --towers with a CLIP (Hugging Face id "
+                    "or folder) to compare it with the images, or a goal of images: last, frame:K, "
+                    "image:PATH or episode:ROOT#K"
+                )
             wanted = ["image"]
         if not wanted:
             raise UserError(
                 f"goal '{spec}' applies to {' and '.join(spec.modalities)}, but this source has "
                 f"{' and '.join(available)} only; leave the goal out"
             )
-        free: list[Modality] = [m for m in wanted if m not in taken]
-        if not free:
+        if taken.keys() >= set(wanted):
             raise UserError(
                 f"goal '{spec}' is never used: '{taken[wanted[0]]}' before it already applies to "
                 f"{' and '.join(wanted)}; put it first or leave it out"
             )
-        for modality in free:
-            taken[modality] = spec
+        taken = dict.fromkeys(wanted, spec) | taken
     return {name: taken[name] for name in MODALITIES if name in taken}
 
 
@@ -360,10 +360,9 @@ def check_goals(goals: Goals, inputs: Inputs) -> None:
             frame_index(spec, inputs.length, inputs.name)
         if isinstance(spec, GoalImage):
             spec.read()
-        if isinstance(spec, EpisodeEnd):
-            spec.read([inputs.camera or FRONT] if modality == "image" else inputs.sides)
-        if isinstance(spec, Bank):
-            spec.ends()
+        if isinstance(spec, EpisodeEnd | Bank):
+            read = [inputs.camera or ft.FRONT] if modality == "image" else inputs.sides
+            spec.ends()[0].read(read)
         if isinstance(spec, GoalFile) and not spec.path.is_file():
             raise UserError(f"goal '{spec}' does not exist: write one with fit-normalizer")
 
@@ -391,11 +390,3 @@ def missing_camera(source: str, camera: str, cameras: Sequence[str]) -> str:
     """Return the message for a source that lacks a camera."""
     there = f"choose --camera {' or '.join(cameras)}" if cameras else "it has no camera"
     return f"{source} has no images of {camera}: {there}"
-
-
-def _no_words(spec: Sentence) -> str:
-    return (
-        f"goal '{spec}' is a sentence, and there is no touch to compare it with; the offline image "
-        "tower knows no words: give --towers with a CLIP (Hugging Face id or folder) to compare it "
-        "with the images, or a goal of images: last, frame:K, image:PATH or episode:ROOT#K"
-    )

@@ -5,12 +5,10 @@ Broken ones are skipped, measured ones are not repeated.
 
 import csv
 import hashlib
-import io
 import json
 import resource
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -27,28 +25,18 @@ from touchgoal.rewards.report.thumbnails import Thumbnails
 from touchgoal.rewards.reward import Reward
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 from touchgoal.rewards.sources.trajectory import Skipped, Trajectory, read_ahead
-from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import progress_bar
 from touchgoal.runtime.version import __version__
 
 SKIPPED = "skipped.csv"
-_RECORDS = "measured"
+_RECORDS, _FORMAT = "measured", 2
 Count = Callable[[int], object]
 """Callback with the number of frames done."""
-
-
-@dataclass(frozen=True)
-class EncoderOptions:
-    """Options by which a node of a cluster loads the encoders; see `Reward`."""
-
-    inputs: Inputs
-    encoder: str | None
-    towers: str | None
-    parts: bool
-
-
+EncoderOptions = tuple[Inputs, str | None, str | None, bool]
+"""Inputs, touch encoder, towers and parts."""
 Result = tuple[EmbeddedEpisode, Thumbnails] | Skipped
 Embed = Callable[[Sequence[Trajectory], Count], Iterator[Result]]
 """Embeds trajectories in their order."""
@@ -94,10 +82,10 @@ class Measurement:
         with progress_bar("measuring", sum(t.length for t in self.missing), "frame") as bar:
             results = embed(self.missing, bar.update)
             for trajectory, result in zip(self.missing, results, strict=True):
-                try:
-                    self._measure(trajectory, result)
-                except UserError as error:
-                    self.skipped.append(Skipped(trajectory.name, str(error)))
+                if isinstance(result, Skipped):
+                    self.skipped.append(result)
+                else:
+                    self._measure(trajectory, *result)
                 done += trajectory.length
                 bar.update(done - bar.n)
         seconds = time.perf_counter() - began
@@ -105,17 +93,18 @@ class Measurement:
         rate = f"{done / seconds:.1f} a second, at most {memory:.2f} GB of memory"
         return f"{done:,} frames in {seconds:.0f} s: {rate}"
 
-    def _measure(self, trajectory: Trajectory, result: Result) -> None:
-        if isinstance(result, Skipped):
-            self.skipped.append(result)
+    def _measure(
+        self, trajectory: Trajectory, embedded: EmbeddedEpisode, thumbnails: Thumbnails
+    ) -> None:
+        name, meta = trajectory.name, trajectory.meta
+        reward, path = self._rewards[name], self._paths[name]
+        try:
+            curves = reward.curves(embedded)
+        except UserError as error:
+            self.skipped.append(Skipped(name, str(error)))
             return
-        (embedded, thumbnails), name = result, trajectory.name
-        reward = self._rewards[name]
-        curves = reward.curves(embedded)
-        meta = trajectory.meta
         about = ", ".join(str(meta[k]) for k in ("object", "outcome") if meta.get(k))
         write_report(curves, self._out, name, reward.provenance(), name in self._plotted, about)
-        path = self._paths[name]
         for stale in path.parent.glob(f"{name}.*.npz"):
             stale.unlink()
         record_of(curves, trajectory, thumbnails).save(path)
@@ -124,6 +113,7 @@ class Measurement:
         """Return the path of a record, which names the recording and what it was measured with."""
         reward = self._rewards[trajectory.name]
         made_of = [
+            _FORMAT,
             __version__,
             trajectory.checksum(),
             reward.provenance(),
@@ -148,23 +138,25 @@ def embed_here(
 
 
 def embed_on_ray(
-    trajectories: Sequence[Trajectory], count: Count, options: EncoderOptions, address: str
+    trajectories: Sequence[Trajectory], count: Count, address: str, encoders: EncoderOptions
 ) -> Iterator[Result]:
-    """Embed each trajectory on a core of a Ray cluster, whose nodes read the same files."""
-    with parallel_map(partial(_embed_apart, options), trajectories, address) as results:
+    """Embed each trajectory on a core of a Ray cluster, whose nodes read the same files.
+
+    With `encoders` each node loads them; see `Reward`.
+    """
+    with parallel_map(partial(_embed_apart, encoders), trajectories, address) as results:
         for trajectory, result in zip(trajectories, results, strict=True):
             count(trajectory.length)
             yield result
 
 
-def _embed_apart(options: EncoderOptions, trajectory: Trajectory) -> Result:
-    return _embed(_load(options), trajectory, trajectory.chunks())
+def _embed_apart(encoders: EncoderOptions, trajectory: Trajectory) -> Result:
+    return _embed(_load(*encoders), trajectory, trajectory.chunks())
 
 
 @lru_cache(maxsize=1)  # a worker embeds many trajectories
-def _load(options: EncoderOptions) -> EpisodeEmbedder:
-    reward = Reward(encoder=options.encoder, towers=options.towers)
-    return reward.embedder(options.inputs, options.parts)
+def _load(inputs: Inputs, encoder: str | None, towers: str | None, parts: bool) -> EpisodeEmbedder:
+    return Reward(encoder=encoder, towers=towers).embedder(inputs, parts)
 
 
 def _embed(embedder: EpisodeEmbedder, trajectory: Trajectory, chunks: Iterable[Episode]) -> Result:
@@ -191,9 +183,7 @@ def write_skipped(skipped: Sequence[Skipped], total: int, out: Path) -> str:
     if not skipped:
         path.unlink(missing_ok=True)
         return f"{total:,} measured"
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["name", "reason"])
-    writer.writerows((one.name, one.reason) for one in skipped)
-    write_file(path, text.getvalue().encode())
+    rows = [("name", "reason"), *((one.name, one.reason) for one in skipped)]
+    with atomic_write(path) as unfinished, unfinished.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
     return f"{len(skipped):,} of {total:,} skipped, see {path}"

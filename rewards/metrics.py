@@ -5,12 +5,13 @@ has no order. Ties share a rank. A bump counts only above the noise, eps = 3 sig
 measured before the contact.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Real
+from jaxtyping import Int, Real
 from scipy import signal, stats
 
 Curve = Real[np.ndarray, "n"]
@@ -21,10 +22,7 @@ EPS_FLOOR = 1e-3
 """Smallest eps, and smallest range of a curve that is not constant (curve). Before the contact a
 simulated curve can be exactly flat; float rounding (about 1e-5 of a normalised curve) must not count."""
 
-MIN_NOISE_FRAMES = 10
-"""Fewest frames before the contact that give sigma; with fewer the whole curve is used."""
-
-DROP_FRACTION = 0.5  # share of the net drop that dates a curve (`t_drop_50`, `contact_lag`)
+_MIN_NOISE_FRAMES = 10  # before the contact that give sigma; with fewer the whole curve is used
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class CurveMetrics:
 
     frames: int  # n
     sigma: float  # noise (curve), 1.4826 MAD(diff d) / sqrt 2 before the contact
-    eps: float  # max(3 sigma, EPS_FLOOR) unless it was given (curve)
+    eps: float  # max(3 sigma, EPS_FLOOR) (curve)
     start: float  # d_0 (curve)
     end: float  # d_T (curve)
     net_drop: float  # d_0 - d_T (curve)
@@ -59,7 +57,7 @@ class CurveMetrics:
         return asdict(self)
 
 
-def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> CurveMetrics:
+def measure_curve(d: Curve, contact: int | None) -> CurveMetrics:
     """Measure one curve.
 
     ValueError: fewer than 2 frames, a value that is not finite, a contact outside the curve.
@@ -67,16 +65,23 @@ def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> Cu
     Args:
         d: distance to the goal per frame, at least 2 frames, finite.
         contact: first frame in contact; None without contact.
-        eps: noise threshold (curve). Default: 3 sigma of this curve. Give the same eps to several
-            curves to compare their peaks on equal terms.
     """
-    d = _validated(d, contact)
+    if len(d) < 2:
+        raise ValueError(f"a curve needs at least 2 frames, this one has {len(d)}")
+    if not np.isfinite(d).all():
+        raise ValueError("the curve has values that are not finite")
+    if contact is not None and not 0 <= contact < len(d):
+        raise ValueError(f"contact frame {contact} lies outside the curve's {len(d)} frames")
+    d = d.astype(np.float64)
     sigma = noise(d, contact)
-    eps = max(3 * sigma, EPS_FLOOR) if eps is None else eps
+    eps = max(3 * sigma, EPS_FLOOR)
     time = np.arange(len(d))
-    not_constant = float(np.ptp(d)) > EPS_FLOOR
-    start, end = start_value(d), float(d[-1])
-    t_drop = time_of_drop(d, DROP_FRACTION, eps)
+    ordered = float(np.ptp(d)) > EPS_FLOOR
+    start, end = float(np.median(d[:START_FRAMES])), float(d[-1])
+    falls = [
+        int(np.argmax(d <= start - share * (start - end))) if start - end > eps else None
+        for share in (0.10, 0.25, 0.50)
+    ]
     return CurveMetrics(
         frames=len(d),
         sigma=sigma,
@@ -84,16 +89,16 @@ def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> Cu
         start=start,
         end=end,
         net_drop=start - end,
-        spearman=spearman(-d, time) if not_constant else None,
-        kendall_tau_b=kendall_tau_b(-d, time) if not_constant else None,
+        spearman=spearman(-d, time) if ordered else None,
+        kendall_tau_b=kendall_tau_b(-d, time) if ordered else None,
         peaks=len(find_peaks(d, eps)),
         largest_rebound=largest_rebound(d),
         area=float(np.mean((d[1:] + d[:-1]) / 2)),
-        t_drop_10=time_of_drop(d, 0.10, eps),
-        t_drop_25=time_of_drop(d, 0.25, eps),
-        t_drop_50=t_drop,
+        t_drop_10=falls[0],
+        t_drop_25=falls[1],
+        t_drop_50=falls[2],
         contact=contact,
-        contact_lag=None if t_drop is None or contact is None else t_drop - contact,
+        contact_lag=None if falls[2] is None or contact is None else falls[2] - contact,
     )
 
 
@@ -104,24 +109,10 @@ def noise(d: Curve, contact: int | None) -> float:
     absolute deviation into a normal standard deviation, and the difference of two frames has
     sqrt 2 times the noise of one. A steady slope leaves MAD(diff d) unchanged.
     """
-    window = d if contact is None or contact < MIN_NOISE_FRAMES else d[:contact]
+    window = d if contact is None or contact < _MIN_NOISE_FRAMES else d[:contact]
     change = np.diff(window)
     mad = np.median(np.abs(change - np.median(change)))
     return float(1.4826 * mad / np.sqrt(2))
-
-
-def start_value(d: Curve) -> float:
-    """Return d_0, the median of the first START_FRAMES frames."""
-    return float(np.median(d[:START_FRAMES]))
-
-
-def time_of_drop(d: Curve, fraction: float, eps: float) -> int | None:
-    """Return the first frame with d <= d_0 - fraction (d_0 - d_T); None if the net drop is at most eps."""
-    start = start_value(d)
-    drop = start - float(d[-1])
-    if drop <= eps:
-        return None
-    return int(np.argmax(d <= start - fraction * drop))
 
 
 def largest_rebound(d: Curve) -> float:
@@ -133,9 +124,7 @@ def find_peaks(d: Curve, eps: float) -> Int[np.ndarray, " peaks"]:
     """Return the frames of the local maxima whose prominence is at least eps.
 
     A run of equal values is one sample (reported at its middle frame), and the first and the last
-    run are no peaks. The prominence of a peak is its height above the higher of two bases, each
-    the lowest value between the peak and the nearest strictly higher value on that side, or the
-    curve's end (the topographic definition, of scipy.signal.peak_prominences).
+    run are no peaks. Prominence is that of scipy.signal.peak_prominences.
     """
     return signal.find_peaks(d, prominence=eps)[0]
 
@@ -151,27 +140,13 @@ def auc(
 
 def spearman(x: Curve, y: Curve) -> float | None:
     """Return the correlation of ranks, ties sharing their mean; None if either is constant."""
-    return None if _constant(x, y) else float(np.asarray(stats.spearmanr(x, y))[0])
+    return _correlation(stats.spearmanr, x, y)
 
 
 def kendall_tau_b(x: Curve, y: Curve) -> float | None:
     """Return Kendall's tau-b, corrected for ties in both; None if either is constant."""
-    return (
-        None
-        if _constant(x, y)
-        else float(np.asarray(stats.kendalltau(x, y, method="asymptotic"))[0])
-    )
+    return _correlation(partial(stats.kendalltau, method="asymptotic"), x, y)
 
 
-def _constant(x: Curve, y: Curve) -> bool:
-    return bool(np.ptp(x) == 0 or np.ptp(y) == 0)
-
-
-def _validated(d: Curve, contact: int | None) -> Float[np.ndarray, " n"]:
-    if len(d) < 2:
-        raise ValueError(f"a curve needs at least 2 frames, this one has {len(d)}")
-    if not np.isfinite(d).all():
-        raise ValueError("the curve has values that are not finite")
-    if contact is not None and not 0 <= contact < len(d):
-        raise ValueError(f"contact frame {contact} lies outside the curve's {len(d)} frames")
-    return d.astype(np.float64)
+def _correlation(of: Callable[[Curve, Curve], Any], x: Curve, y: Curve) -> float | None:
+    return float(np.asarray(of(x, y))[0]) if np.ptp(x) and np.ptp(y) else None

@@ -1,5 +1,6 @@
 """The cost of a run while it happens, as `reward-curves` computes it from the recording; its judgement."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -35,11 +36,10 @@ _FIRST_COST_TIMEOUT = 60.0  # s for the first cost, which warms up the networks
 _IDLE_SLEEP = 0.005  # s between looks for a new tick
 _JUDGE_INTERVAL = 1.0  # s from one judgement of a run to the next
 _REST_SECONDS, _REST_SPEED = 0.5, 0.02  # s, rad/s: the joints rest if none was faster for so long
-_MOST_WAITING = 20  # ticks to be measured; older ones are left out where time does not wait
 
 
 class CostMeter:
-    """Measures the cost of one tick after the other, with the numbers of `reward-curves`.
+    """Measures the newest tick of a run, with the numbers of `reward-curves`.
 
     They are equal from the fifth tick on. Before, the fingertips' background is the median of the
     ticks so far, while a recording's is always that of its first five.
@@ -47,6 +47,7 @@ class CostMeter:
     Attributes:
         judges: whether the run is judged, once a second.
         judgement: the newest; None before the first.
+        waiting: ticks to be measured, those of a second at most.
     """
 
     def __init__(
@@ -76,12 +77,14 @@ class CostMeter:
         self._reward, self._object, self._rate, self.judges = reward, object_name, rate, judges
         if judges:
             _ = reward.judge  # an error is told before the run
+        self.waiting: deque[tuple[float, ft.Observation]] = deque(maxlen=math.ceil(rate))
         self._goal: EmbeddedGoal | None = None
         self._stream: FeatureStream | None = None
+        self.forget()
         self._begin(())
 
-    def _begin(self, first: Sequence[ft.Observation]) -> None:
-        self._first = first  # that the stream's background is the median of
+    def _begin(self, background: Sequence[ft.Observation]) -> None:
+        self._background = background  # ticks that the stream's background is the median of
         self._parts: dict[str, float] = {}  # cost of each part at the tick before
         self._felt: list[Features] = []  # of touch and arm, of all ticks so far
         self._seen: EmbeddedEpisode | None = None  # the newest ticks, images included
@@ -89,37 +92,51 @@ class CostMeter:
         self.judgement: Judgement | None = None
         self._successes = 0  # judgements in a row
 
-    @property
-    def done(self) -> bool:
-        """Whether the last two judgements, a second apart, said success while the arm rested."""
-        return self._successes > 1
+    def forget(self) -> None:
+        """Take the next tick as the first one of a run."""
+        self._first: tuple[ft.Observation, ...] = ()
+        self.waiting.clear()
 
-    def measure(
-        self,
-        observation: ft.Observation,
-        first: Sequence[ft.Observation],
-        missed: Sequence[ft.Observation] = (),
-    ) -> float:
-        """Return the cost of a tick: fused, or the mean over the modalities without parts.
+    def add(self, tick: ft.Observation) -> None:
+        """Take the next tick; the first 5 are free of contact."""
+        if len(self._first) < START_FRAMES:
+            self._first = (*self._first, tick)
+        self.waiting.append((time.monotonic(), tick))
 
-        `first` are the run's first ticks in order, at most five. While more of them come in, the
-        background changes, and they are measured anew. `missed` are the ticks since the last measured
-        one; a judge needs them, but not their images.
+    def measure(self) -> CostReading | None:
+        """Return the cost of the newest tick, fused, or the mean over the modalities without parts.
+
+        None if it was measured before. A judge needs the ticks before it, too, but not their images.
+        While less than 5 ticks have come in, each changes the background, and all are measured anew.
+        The run is done once two judgements, a second apart, said success while the arm rested.
         """
-        ticks, seen = [*missed, observation], 1
-        if self._stream is None or len(first) != len(self._first) or first[0] is not self._first[0]:
+        first, waiting = self._first, []
+        while self.waiting:
+            waiting.append(self.waiting.popleft())
+        if not waiting:
+            return None
+        stamp, newest = waiting[-1]
+        ticks, first = (
+            [tick for _, tick in waiting] if self.judges else [newest],
+            first or (newest,),
+        )
+        seen, known, reward = 1, self._background, self._reward
+        if self._stream is None or len(first) != len(known) or first[0] is not known[0]:
+            missed = len(ticks) > 1
             ticks = list({id(tick): tick for tick in (*first, *ticks)}.values())
-            self._stream = self._reward.embedder.stream(_stacked(first), self._rate, "this run")
-            seen = seen if missed else len(ticks)
+            seen = 1 if missed else len(ticks)
+            self._stream = reward.embedder.stream(_stacked(first), self._rate, "this run")
             self._begin(first)
         embedded = replace(self._stream.embed(_stacked(ticks, seen)), object=self._object)
-        trajectory, reward = embedded.take(slice(-seen, None)), self._reward
+        trajectory = embedded.take(slice(-seen, None))
         if self._goal is None:
             self._goal = reward.embedder.embed_goal(reward.goals, trajectory)
         curves = compute_curves(
             trajectory, self._goal, reward.normalizer, reward.value, self._parts, reward.plain
         )
         self._parts = {name: float(cost[-1]) for name, cost in curves.parts.items()}
+        names = [FUSED] if FUSED in curves.parts else curves.raw
+        cost = float(np.mean([curves.costs[name][-1] for name in names]))
         if self.judges:
             self._seen = trajectory
             self._felt.append(split_features(embedded.features)[1])
@@ -128,9 +145,9 @@ class CostMeter:
             self._unjudged += len(ticks)
             if self._unjudged >= _JUDGE_INTERVAL * self._rate:
                 self.judge()
-        if FUSED in curves.parts:
-            return self._parts[FUSED]
-        return float(np.mean([curves.costs[name][-1] for name in curves.raw]))
+        if (told := self.judgement) is None:
+            return CostReading(cost, stamp)
+        return CostReading(cost, stamp, told.verdict, told.reasons, self._successes > 1)
 
     def judge(self) -> Judgement:
         """Judge the newest tick as the end of the run; at least one was measured."""
@@ -170,27 +187,27 @@ class OnlineCost:
         """
         self._meter, self._rise, self._waits = meter, give_up or float("inf"), time_waits
         self.failed = False  # whether the cost has risen by `give_up` for 20 measurements
-        self._first: tuple[ft.Observation, ...] = ()  # the run's first ticks, without contact
-        self._ticks: deque[tuple[float, ft.Observation]] = deque(maxlen=_MOST_WAITING)
+        self._begun = False
         self._measuring = Lock()
         self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)
 
     def begin(self, observation: ft.Observation) -> None:
         """See Cost; the first measurement warms up the networks."""
-        self.failed, self._first = False, ()
+        self.failed = self._begun = False
         self._watch, self._watched = FailureWatch(self._rise, ft.CONTROL_HZ), time.monotonic()
-        self._ticks.append((time.monotonic(), observation))
+        self._meter.forget()
+        self._meter.add(observation)
 
     def hand_over(self, observation: ft.Observation) -> None:
         """See Cost."""
-        if not self._first:
-            self._ticks.clear()  # of what `begin` was given
-        while self._waits and self._meter.judges and len(self._ticks) == _MOST_WAITING:
+        if not self._begun:
+            self._meter.forget()  # what `begin` was given
+            self._begun = True
+        waiting = self._meter.waiting
+        while self._waits and self._meter.judges and len(waiting) == waiting.maxlen:
             self._latest.read()  # DriverError if the thread has ended
             time.sleep(_IDLE_SLEEP)
-        self._ticks.append((time.monotonic(), observation))
-        if len(self._first) < START_FRAMES:
-            self._first = (*self._first, observation)
+        self._meter.add(observation)
 
     def read(self) -> CostReading:
         """See Cost; the cost is the mean over the modalities that have a goal.
@@ -207,7 +224,7 @@ class OnlineCost:
         """See Cost."""
         reading = self._latest.read()  # DriverError if no cost can be measured
         with self._measuring:
-            reading = self._measure() or reading
+            reading = self._meter.measure() or reading
             if not self._meter.judges:
                 return reading
             told = self._meter.judge()
@@ -218,26 +235,12 @@ class OnlineCost:
         self._latest.close()
 
     def _measure_newest(self) -> CostReading | None:
+        torch.set_num_threads(1)  # of this thread: the control loop needs the other core
         with self._measuring:
-            reading = self._measure()
+            reading = self._meter.measure()
         if reading is None:
             time.sleep(_IDLE_SLEEP)
         return reading
-
-    def _measure(self) -> CostReading | None:
-        """Measure the newest tick; None if it was measured before."""
-        first, ticks, meter = self._first, [], self._meter
-        while self._ticks:
-            ticks.append(self._ticks.popleft())
-        if not ticks:
-            return None
-        torch.set_num_threads(1)  # of this thread: the control loop needs the other core
-        stamp, newest = ticks[-1]
-        missed = [tick for _, tick in ticks[:-1]] if meter.judges else ()
-        cost, told = meter.measure(newest, first or (newest,), missed), meter.judgement
-        if told is None:
-            return CostReading(cost, stamp)
-        return CostReading(cost, stamp, told.verdict, told.reasons, meter.done)
 
 
 class FailureWatch:
@@ -265,17 +268,15 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
     UserError: a goal, encoder or normalizer that does not fit the cell.
     """
     simulated = cell.arm == "sim" or bool(cell.task.twin)
-    cameras = tuple(key for key in ft.CAMERAS if key.removeprefix(ft.IMAGE_PREFIX) in cell.cameras)
-    inputs = Inputs(
-        name="the cell",
-        camera=ft.FRONT if ft.FRONT in cameras else None,
-        sides=ft.TACTILE if cell.fingertips is not None else (),
-        sensor=cell.sensor,
-        scene=f"simulated {cell.task.simulated}" if simulated else REAL_SCENE,
-        cameras=cameras,
-        task=cell.task.instruction or cell.task.name,
-    )
+    keys = {f"{ft.IMAGE_PREFIX}{name}" for name in cell.cameras}
     task = cell.task
+    inputs = Inputs.of(
+        "the cell",
+        keys | set(ft.TACTILE if cell.fingertips is not None else ()),
+        sensor=cell.sensor,
+        scene=f"simulated {task.simulated}" if simulated else REAL_SCENE,
+        task=task.instruction or task.name,
+    )
     if task.judge:
         reward = Reward.of_judge(task.judge, task.encoder or None)
     else:

@@ -7,7 +7,7 @@ from typing import overload
 import numpy as np
 import torch
 
-from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE
+from touchgoal.control.features import CONTROL_HZ, FRONT
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.preprocess import check_images
@@ -101,17 +101,12 @@ class Reward:
         """
         self.goals = goals_of_script(goal)
         self._encoder, self._towers, self._plain, self._device = encoder, towers, plain, device
-        self._choice: str | None = None  # "encoder", "none", or None to choose by the scene
-        self._given: DistanceNormalizer | None = None
+        self._normalizer = normalizer  # one read, or "encoder", "none", or None: by the scene
         self._folder: Path | None = None  # of the given normalizer
         self._name = "the given normalizer"
-        if isinstance(normalizer, DistanceNormalizer):
-            self._given = normalizer
-        elif normalizer is None or str(normalizer) in ("encoder", "none"):
-            self._choice = None if normalizer is None else str(normalizer)
-        else:
-            self._given, self._name = DistanceNormalizer.load(Path(normalizer)), str(normalizer)
-            self._folder = Path(normalizer).parent
+        if isinstance(normalizer, str | Path) and str(normalizer) not in ("encoder", "none"):
+            self._normalizer = DistanceNormalizer.load(Path(normalizer))
+            self._name, self._folder = str(normalizer), Path(normalizer).parent
         self._encoders: dict[str | None, tuple[AnyTouchEncoder, Path | None]] = {}  # by sensor
         self._loaded_towers: dict[str, Towers] = {}  # by name
         self._embedders: dict[tuple[str | None, ...], EpisodeEmbedder] = {}
@@ -226,17 +221,19 @@ class Reward:
         """
         key = inputs.camera, inputs.sensor, *inputs.sides[:1], str(parts)
         if key not in self._embedders:
-            _check_device(self._device)
+            try:
+                torch.zeros(1, device=self._device)
+            except (RuntimeError, AssertionError, NotImplementedError) as error:
+                why = f"cannot be used here ({str(error).splitlines()[0]})"
+                raise UserError(f"--device {self._device} {why}: give cpu") from error
             touch, towers = self._touch_encoder(inputs)[0], self._towers
             if isinstance(towers, str) or towers is None:
-                towers = self._load_towers(towers or (touch and touch.towers) or OfflineTowers.name)
+                name = towers or (touch and touch.towers) or OfflineTowers.name
+                if name not in self._loaded_towers:
+                    self._loaded_towers[name] = load_towers(name, self._device)
+                towers = self._loaded_towers[name]
             self._embedders[key] = EpisodeEmbedder(towers, touch, inputs.camera or "", parts)
         return self._embedders[key]
-
-    def _load_towers(self, name: str) -> Towers:
-        if name not in self._loaded_towers:
-            self._loaded_towers[name] = load_towers(name, self._device)
-        return self._loaded_towers[name]
 
     def _touch_encoder(self, inputs: Inputs) -> tuple[AnyTouchEncoder | None, Path | None]:
         """Return the touch encoder, and the folder that may hold a normalizer."""
@@ -261,28 +258,41 @@ class Reward:
         self, inputs: Inputs, goals: Goals, embedder: EpisodeEmbedder
     ) -> tuple[DistanceNormalizer | None, Value | None, str, Path | None]:
         """Return the normalizer, the value beside it, which ones these are, and their folder."""
-        if self._choice == "none":
+        given, name, folder, reason = self._normalizer, self._name, self._folder, ""
+        if given == "none":
             return None, None, "normalizer: none, raw cosine distances", None
-        if (given := self._given) is not None:
-            if reason := _mismatch(given, goals, embedder):
-                raise UserError(f"{self._name} does not apply here: {reason}; {REMEDY}")
-            value, reason = _value_in(self._folder, inputs, embedder)
-            if reason:
-                raise UserError(f"{reason}; {VALUE_REMEDY}")
-            beside = "" if value is None else ", with the value beside it"
-            return given, value, f"normalizer: {self._name}{beside}", self._folder
-        folder = self._touch_encoder(inputs)[1]
-        scene = inputs.scene if self._choice is None else None
-        found, reason = _normalizer_in(folder, scene, goals, embedder)
-        if found is None and self._choice == "encoder":
-            raise UserError(f"the encoder's normalizer does not apply: {reason}; {REMEDY}")
+        found = given if isinstance(given, DistanceNormalizer) else None
         if found is None:
+            folder = self._touch_encoder(inputs)[1]
+            name = str(path := (folder or Path()) / NORMALIZER)
+            if folder is None:
+                reason = "published weights and loaded encoders come without a normalizer"
+            elif not path.is_file():
+                reason = f"there is no {path}"
+            else:
+                found = DistanceNormalizer.load(path)
+        if found is not None:
+            unfit = found.mismatch(embedder.made_with, goals, same_episode(goals))
+            if given is None and found.scene != inputs.scene:
+                unfit = (
+                    f"it was fitted on {found.scene} episodes and the scene here is {inputs.scene}"
+                )
+            reason = unfit and f"{name} does not apply here: {unfit}"
+        if found is None or reason:
+            if given is not None:
+                raise UserError(f"{reason}; {REMEDY}")
             note = f"raw cosine distances, for {reason}; to normalise them: {_FIT}"
             return None, None, note, None
-        value, why_not = _value_in(folder, inputs, embedder)
-        beside = "" if value is None else ", with the value beside it"
-        without = f"; without the value, for {why_not}" if why_not else ""
-        return found, value, f"normalizer: {reason}{beside}{without}", folder
+        value = beside = None
+        if folder is not None and VALUE_FORMAT.weights_path(folder).is_file():
+            value, beside = Value.load(folder), ", with the value beside it"
+            task, towers = inputs.fitted_task, embedder.made_with.towers
+            if reason := value.mismatch(task, inputs.cameras, towers):
+                reason = f"the value in {folder} does not apply here: {reason}"
+                if found is given:
+                    raise UserError(f"{reason}; {VALUE_REMEDY}")
+                value, beside = None, f"; without the value, for {reason}"
+        return found, value, f"normalizer: {name}{beside or ''}", folder
 
     def _embed_set(
         self,
@@ -305,20 +315,17 @@ class Reward:
         sensor = episode.meta.get("sensor")
         if sensor is None and scene == _ARRAYS and self._encoder is None:
             sensor = pretrained.DEFAULT_ENCODER.name
-        inputs = Inputs(
-            name="this trajectory",
-            camera=camera if camera in episode.frames else None,
-            sides=tuple(key for key in TACTILE if key in episode.frames),
+        inputs = Inputs.of(
+            "this trajectory",
+            episode.frames,
+            camera,
             sensor=None if sensor is None else str(sensor),
             scene=scene,
             length=len(episode),
-            cameras=tuple(key for key in CAMERAS if key in episode.frames),
             task=episode.task,
         )
-        goals = [
-            goal.beside(episode.frames) if isinstance(goal, TouchArrays) else goal
-            for goal in self.goals
-        ]
+        frames = episode.frames
+        goals = [g.beside(frames) if isinstance(g, TouchArrays) else g for g in self.goals]
         prepared = self.prepare(inputs, goals)
         return prepared, prepared.embedder.embed_episode(episode, fps, inputs.name)
 
@@ -342,14 +349,6 @@ def _as_episode(
     return Episode({names[name]: frames for name, frames in given.items()}, "")
 
 
-def _check_device(device: str) -> None:
-    try:
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"--device {device} cannot be used here ({reason}): give cpu") from error
-
-
 def _shipped_for(inputs: Inputs) -> Path:
     images_alone = "or measure the images alone: --towers offline"
     if inputs.sensor is None:
@@ -358,40 +357,3 @@ def _shipped_for(inputs: Inputs) -> Path:
         return pretrained.shipped_encoder_for(inputs.sensor)
     except UserError as error:
         raise UserError(f"{error}; {images_alone}") from None
-
-
-def _mismatch(
-    normalizer: DistanceNormalizer, goals: Goals, embedder: EpisodeEmbedder
-) -> str | None:
-    return normalizer.mismatch(embedder.made_with, goals, same_episode(goals))
-
-
-def _normalizer_in(
-    folder: Path | None, scene: str | None, goals: Goals, embedder: EpisodeEmbedder
-) -> tuple[DistanceNormalizer | None, str]:
-    """Return the normalizer in an encoder's folder and its path, or None and why it is not used.
-
-    It must have been fitted on the scene, if one is given.
-    """
-    if folder is None:
-        return None, "published weights and loaded encoders come without a normalizer"
-    path = folder / NORMALIZER
-    if not path.is_file():
-        return None, f"there is no {path}"
-    found = DistanceNormalizer.load(path)
-    reason = _mismatch(found, goals, embedder)
-    if scene is not None and found.scene != scene:
-        reason = f"it was fitted on {found.scene} episodes and the scene here is {scene}"
-    return (None, f"{path} does not apply: {reason}") if reason else (found, str(path))
-
-
-def _value_in(
-    folder: Path | None, inputs: Inputs, embedder: EpisodeEmbedder
-) -> tuple[Value | None, str]:
-    """Return the value beside a normalizer, and why it does not hold here; None without one."""
-    if folder is None or not VALUE_FORMAT.weights_path(folder).is_file():
-        return None, ""
-    value = Value.load(folder)
-    if reason := value.mismatch(inputs.fitted_task, inputs.cameras, embedder.made_with.towers):
-        return None, f"the value in {folder} does not apply here: {reason}"
-    return value, ""

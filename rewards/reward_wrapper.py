@@ -7,9 +7,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from touchgoal.control.features import CAMERAS, CONTROL_HZ, FRONT, TACTILE, Observation
+from touchgoal.control.features import CONTROL_HZ, Observation
 from touchgoal.rewards.goals import Inputs
-from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.online import CostMeter
 from touchgoal.rewards.reward import Reward
 
@@ -22,15 +21,9 @@ def inputs_of(env: gym.Env) -> Inputs:
     space = env.observation_space
     keys = set(space) if isinstance(space, gym.spaces.Dict) else set()
     sensor, task = (getattr(env.unwrapped, name, None) for name in ("sensor", "task"))
-    return Inputs(
-        name="the environment",
-        camera=FRONT if FRONT in keys else None,
-        sides=tuple(key for key in TACTILE if key in keys),
-        sensor=getattr(sensor, "name", None),
-        scene=f"simulated {task}" if task else "unknown",
-        cameras=tuple(key for key in CAMERAS if key in keys),
-        task=str(task or ""),
-    )
+    scene, task = f"simulated {task}" if task else "unknown", str(task or "")
+    sensor = getattr(sensor, "name", None)
+    return Inputs.of("the environment", keys, sensor=sensor, scene=scene, task=task)
 
 
 class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
@@ -50,7 +43,6 @@ class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray
         self._rate = float(rate)
         self._reward = reward.prepare(inputs_of(env))
         self._meter = CostMeter(self._reward, rate=self._rate)
-        self._first: list[Observation] = []
         self._cost = 0.0
 
     def reset(
@@ -59,7 +51,6 @@ class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray
         """Start an episode, whose first observations must be free of contact."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._meter = CostMeter(self._reward, str(info.get("object", "")), self._rate)
-        self._first = []
         self._cost = self._measure(observation)
         return observation, {**info, "cost": self._cost}
 
@@ -71,9 +62,10 @@ class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray
         return observation, before - self._cost, terminated, truncated, info
 
     def _measure(self, observation: Observation) -> float:
-        if len(self._first) < START_FRAMES:
-            self._first.append(observation)
-        return self._meter.measure(observation, self._first)
+        self._meter.add(observation)
+        reading = self._meter.measure()
+        assert reading is not None  # of the observation just added
+        return reading.cost
 
 
 class RunJudge:
@@ -87,28 +79,17 @@ class RunJudge:
         reward = _judged_reward(judge).prepare(inputs_of(env))
         about, self._rate = env.unwrapped.episode_info(), env.unwrapped.config.control_hz  # pyright: ignore[reportAttributeAccessIssue]
         self._meter = CostMeter(reward, str(about.get("object", "")), self._rate, judges=True)
-        self._first: tuple[Observation, ...] = ()
-        self._waiting: list[Observation] = []  # to be measured
 
     def ended(self, tick: Observation) -> bool:
         """Take the next tick; return whether the judge says lastingly that the task is done."""
-        if len(self._first) < START_FRAMES:
-            self._first = (*self._first, tick)
-        self._waiting.append(tick)
-        if len(self._waiting) >= self._rate:
-            self._measure()
-        return self._meter.done
+        self._meter.add(tick)
+        reading = self._meter.measure() if len(self._meter.waiting) >= self._rate else None
+        return reading is not None and reading.done
 
     def verdict(self) -> str:
         """Return the verdict on the newest tick as the episode's end."""
-        if self._waiting:
-            self._measure()
+        self._meter.measure()
         return self._meter.judge().verdict
-
-    def _measure(self) -> None:
-        *missed, newest = self._waiting
-        self._meter.measure(newest, self._first, missed)
-        self._waiting = []
 
 
 _judged_reward = cache(Reward.of_judge)  # encoders are loaded once a process

@@ -115,7 +115,18 @@ def fit_value(episodes: Sequence[EmbeddedEpisode], task: str) -> Value:
 
     UserError: fewer than 4 episodes, or one without the maps of all cameras.
     """
-    keys = _check(episodes)
+    if len(episodes) < LEAST_EPISODES:
+        raise UserError(
+            f"a value needs at least {LEAST_EPISODES} successful episodes, these are {len(episodes)}"
+        )
+    names = cameras_of(episodes[0].features)
+    for e in episodes:
+        if not names or any(map_name(name) not in e.features for name in names):
+            raise UserError(
+                f"{e.source} has no feature maps of {' and '.join(names) or 'a camera'}: a value "
+                "needs the offline towers and the same cameras in every episode"
+            )
+    keys = tuple(IMAGE_PREFIX + name for name in names)
     step = -(-sum(len(e) for e in episodes) // _MOST_FRAMES)
     maps = torch.from_numpy(np.concatenate([_stacked(e.features, keys)[::step] for e in episodes]))
     target = torch.cat([torch.linspace(0, 1, len(e))[::step] for e in episodes])
@@ -142,22 +153,6 @@ def _regress(
         loss.backward()
         optimizer.step()
         schedule.step()
-
-
-def _check(episodes: Sequence[EmbeddedEpisode]) -> tuple[str, ...]:
-    """Return the keys of the cameras that a value looks through."""
-    if len(episodes) < LEAST_EPISODES:
-        raise UserError(
-            f"a value needs at least {LEAST_EPISODES} successful episodes, these are {len(episodes)}"
-        )
-    names = cameras_of(episodes[0].features)
-    for e in episodes:
-        if not names or any(map_name(name) not in e.features for name in names):
-            raise UserError(
-                f"{e.source} has no feature maps of {' and '.join(names) or 'a camera'}: a value "
-                "needs the offline towers and the same cameras in every episode"
-            )
-    return tuple(IMAGE_PREFIX + name for name in names)
 
 
 def _stacked(features: Features, keys: Sequence[str]) -> Float16[np.ndarray, "n cameras c yx"]:

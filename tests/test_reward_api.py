@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from touchgoal.control.features import (
     TRUTH_CONTACT,
     TRUTH_START,
 )
+from touchgoal.control.interfaces import CostReading
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
@@ -264,13 +266,18 @@ def test_cost_during_a_run_is_raw_without_normalizer(encoder: TouchEncoder) -> N
 class Rising(CostMeter):
     """A meter of a cost that rises at the second measurement, after which it hangs until it may go on."""
 
-    judges, judgement = False, None
+    judges = False
 
     def __init__(self) -> None:
-        self.costs, self.may_go_on = [0.1, 0.9], threading.Event()
+        self.waiting, self.costs, self.may_go_on = deque(), [0.1, 0.9], threading.Event()
 
-    def measure(self, observation: dict, first: object, missed: object = ()) -> float:
-        return self.costs.pop(0) if self.costs else self.may_go_on.wait() * 0.9
+    def measure(self) -> CostReading | None:
+        if not self.waiting:
+            return None
+        stamp = self.waiting.pop()[0]
+        self.waiting.clear()
+        cost = self.costs.pop(0) if self.costs else self.may_go_on.wait() * 0.9
+        return CostReading(cost, stamp)
 
 
 def test_one_high_cost_and_a_meter_that_hangs_are_no_failed_run() -> None:
@@ -316,7 +323,8 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder) -> No
     assert np.ptp(expected) > 0.05
     meter = meter_of(encoder, normalizer, IMAGES[9], "soft")
     ticks = [{key: values[i] for key, values in frames.items()} for i in range(len(IMAGES))]
-    during = [meter.measure(tick, ticks[: min(i + 1, 5)]) for i, tick in enumerate(ticks)]
+    during = [(meter.add(tick), meter.measure())[1] for tick in ticks]
+    during = [reading.cost for reading in during if reading]
     np.testing.assert_allclose(during[4:], expected[4:], atol=1e-6)
     assert np.abs(during[0] - expected[0]) > 1e-4  # one frame is another background
 
@@ -345,14 +353,16 @@ def test_a_run_is_judged_as_its_recording_and_ends_when_it_rests(
     meter, told, done = CostMeter(reward, rate=4.0, judges=True), [], []
     ticks = [{key: values[i] for key, values in frames.items()} for i in range(24)]
     for i in (0, 1, 2, 3, 4, 7, 8, 11, 15, 19, 23):
-        missed = ticks[{7: 5, 11: 9, 15: 12, 19: 16, 23: 20}.get(i, i) : i]
-        meter.measure(ticks[i], ticks[: min(i + 1, 5)], missed)
+        for tick in ticks[{7: 5, 11: 9, 15: 12, 19: 16, 23: 20}.get(i, i) : i + 1]:
+            meter.add(tick)
+        reading = meter.measure()
+        assert reading is not None and meter.measure() is None
         if meter.judgement is not (told[-1] if told else None):
             told.append(meter.judgement)
             expected = reward.judge_episode(recording.take(slice(0, i + 1)))
             assert told[-1].verdict == expected.verdict
             assert told[-1].parts == pytest.approx(expected.parts, abs=1e-5)
-        done.append(meter.done)
+        done.append(reading.done)
     assert [t.verdict for t in told] == ["failure"] * 2 + ["success"] * 4
     assert done == [False] * 10 + [True]  # it moved until tick 17, and was judged at 15, 19 and 23
 

@@ -15,8 +15,6 @@ from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, fit_units
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.rewards.distance.parts import (
-    contact_distances,
-    gate,
     goal_spread,
     object_distances,
     part_costs,
@@ -151,8 +149,9 @@ def test_before_contact_the_fingertips_cost_the_same_whatever_they_read(
     for name in ("object", "force", "centre", "held"):
         assert parts[name][:GRASP] == pytest.approx(np.ones(GRASP)), name
     assert np.ptp(parts["fused"][:GRASP]) > 0.01  # the images lead
-    costs, touching = np.array([0.2, 0.3]), np.array([False, True])
-    assert gate(costs, touching, goal_touches=False) == pytest.approx([0, 0.3])
+    free = {**goal.features, "held": np.zeros((1, 2), bool)}
+    costs = part_costs(embedded(9).features, free, normalizer.unit)
+    assert costs["object"][:GRASP] == pytest.approx(np.zeros(GRASP)) and costs["object"][-1] < 0.5
 
 
 def test_pieces_of_a_trajectory_cost_the_same_as_the_whole(
@@ -173,10 +172,12 @@ def test_distances_by_hand() -> None:
     def readings(touching: list[bool], force: list[float], x: list[float]) -> Features:
         centre = np.stack([x, np.zeros(len(x))], 1)[:, None].astype(np.float32)
         numbers = np.array(force, np.float32)[:, None]
-        return {"held": np.array(touching)[:, None], "force": numbers, "centre": centre}
+        touch = np.ones((len(x), 1, 2), np.float32)
+        held = np.array(touching)[:, None]
+        return {"touch": touch, "held": held, "force": numbers, "centre": centre}
 
     light = readings([True, False], [9.5, 0], [3e-3, 0])
-    d = contact_distances(light, readings([True], [39.5], [0]))
+    d = part_distances(light, readings([True], [39.5], [0]))
     wanted = {"force": np.full((1, 1), 39.5, np.float32)}
     assert part_distances(light, wanted)["force"][:, 0].tolist() == [30, 39.5]
     assert d["centre"][:, 0] == pytest.approx([3e-3, 0.02]) and d["held"][:, 0].tolist() == [0, 1]

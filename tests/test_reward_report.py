@@ -30,7 +30,7 @@ from touchgoal.rewards.measure import Measurement, embed_here, write_skipped
 from touchgoal.rewards.metrics import measure_curve
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.plot import CURVES, curve_colors, line_styles, plot
-from touchgoal.rewards.report.record import Facts, Record, load_facts, record_of
+from touchgoal.rewards.report.record import Facts, Record, record_of
 from touchgoal.rewards.report.report import report_all
 from touchgoal.rewards.report.tables import ends_table, metrics_table, outcome_table
 from touchgoal.rewards.report.thumbnails import Thumbnails
@@ -296,7 +296,7 @@ def pages(episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ca
 
     def write(per_page: int) -> Path:
         monkeypatch.setattr("touchgoal.rewards.report.page.PER_PAGE", per_page)
-        all_facts = [load_facts(path) for path in measurement.records]
+        all_facts = [Record.load(path).facts for path in measurement.records]
         return write_pages(measurement.records, all_facts, tmp_path / "out", ["title\n<b>"])
 
     return write

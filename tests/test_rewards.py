@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from touchgoal.control.features import TACTILE_LEFT, TACTILE_RIGHT
-from touchgoal.rewards.curves import Contact, Curves, potential_reward, state_reward
+from touchgoal.rewards.curves import Contact, Curves, potential_reward
 from touchgoal.rewards.distance.cost import compute_curves, plain_distances
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
@@ -221,13 +221,16 @@ def test_a_normalizer_of_other_embeddings_is_refused(what: str) -> None:
     good = embedded("good")
     normalizer = replace_text(fit_scene([good, replace(good)], ["image", "tactile"]))
     other = replace(good, made_with=replace(MADE, **{what: "z"}))
-    with pytest.raises(UserError, match=f"does not apply: it was fitted with the .*{what}, not z"):
+    with pytest.raises(
+        UserError, match=f"does not apply: .* its {what} is {getattr(MADE, what)}, not z"
+    ):
         compute_curves(other, goal_of(good), normalizer)
 
 
 def test_rewards_by_hand() -> None:
     cost = np.array([1.0, 0.4, 0.6, 0.0])
-    assert state_reward(cost) == pytest.approx([-1.0, -0.4, -0.6, 0.0])
+    curves = Curves("a", {}, 20.0, Contact(None, "no touch"), {"image": cost}, {})
+    assert curves.rewards["image"] == pytest.approx([-1.0, -0.4, -0.6, 0.0])
     assert potential_reward(cost, 1.0) == pytest.approx([0.0, 0.6, -0.2, 0.6])
     # gamma * -0.4 + 1, gamma * -0.6 + 0.4, 0.6
     assert potential_reward(cost, 0.9) == pytest.approx([0.0, 0.64, -0.14, 0.6])

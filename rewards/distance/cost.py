@@ -18,10 +18,10 @@ from touchgoal.rewards.distance.parts import (
     Costs,
     cosine_distances,
     force_distances,
-    mean_products,
     part_costs,
     smooth_and_fuse,
     soft_minimum,
+    touch_distances,
 )
 from touchgoal.rewards.features.embedded import (
     IMAGE,
@@ -35,9 +35,7 @@ from touchgoal.rewards.features.embedded import (
 from touchgoal.rewards.value import Value
 
 _ALPHA = 0.5  # share of the way to the line through baseline and sentence
-_FORCE_UNIT = (
-    0.5  # share of a force goal: without force, or with twice as much, its part costs 0.64
-)
+_FORCE_UNIT = 0.5  # share of a force goal: without force, or with twice as much, it costs 0.64
 
 
 def compute_curves(
@@ -62,11 +60,10 @@ def compute_curves(
         newtons = float(wanted.mean())
         raw[FORCE] = force_distances(episode.features[FORCE], wanted)[:, 0] / newtons
         units = units and units | {FORCE: _FORCE_UNIT * newtons}
-    same = goal.same_episode
     normalised: Costs = {}
     parts: Costs = {}
     if normalizer is not None:
-        normalised = normalizer.normalise(raw, episode.made_with, same)
+        normalised = normalizer.normalise(raw, episode.made_with, goal.same_episode)
     if units:
         parts = part_costs(episode.features, goal.features, units)
         if value is not None:
@@ -74,16 +71,8 @@ def compute_curves(
         if "text" in normalised:
             parts[WORDS] = np.clip(normalised["text"], 0, 1)
         parts = smooth_and_fuse(parts, episode.fps, before)
-    return Curves(
-        episode.source,
-        goal.forms,
-        episode.fps,
-        episode.contact,
-        raw,
-        normalised,
-        parts,
-        same.intersection(raw),
-    )
+    about = episode.source, goal.forms, episode.fps, episode.contact
+    return Curves(*about, raw, normalised, parts, goal.same_episode.intersection(raw))
 
 
 def plain_distances(mine: Features, goal: Features, completed: bool) -> Costs:
@@ -110,13 +99,6 @@ def complete(touch: Float32[np.ndarray, "*n k"]) -> Float32[np.ndarray, "*n k+1"
     """
     missing = 1 - np.square(touch).sum(-1, keepdims=True)
     return np.concatenate([touch, np.sqrt(np.maximum(missing, 0))], -1)
-
-
-def touch_distances(
-    touch: Float32[np.ndarray, "n sides k"], goals: Float32[np.ndarray, "g sides k"]
-) -> Float[np.ndarray, "n g"]:
-    """Return the distance of each touch to each goal's same fingertip, mean over the fingertips."""
-    return 1 - mean_products(touch, goals)
 
 
 def text_distances(

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.rewards.distance.cost import text_distances, touch_distances
+from touchgoal.rewards.distance.cost import text_distances
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, median_name
 from touchgoal.rewards.distance.parts import (
     SMALLEST_UNIT,
     SPREAD_QUANTILE,
     cosine_distances,
     part_distances,
+    touch_distances,
 )
 from touchgoal.rewards.features.embedded import IMAGE, TOUCH, EmbeddedEpisode, last_rows
 from touchgoal.rewards.goals import Modality
@@ -51,13 +52,23 @@ def fit_normalizer(
         for same_episode in (False, True) if modality != "text" else (False,):
             starts, ends = _training_distances(episodes, modality, same_episode)
             name = median_name(modality, same_episode)
-            separated[name] = _check_separation(name, starts, ends)
-            start[name], goal[name] = float(np.median(starts)), float(np.median(ends))
-    units, made_with = fit_units(episodes), episodes[0].made_with
-    command = portable(command_line())
-    return DistanceNormalizer(
-        start, goal, units, separated, made_with, scene, len(episodes), command
-    )
+            if not len(starts):
+                raise UserError(
+                    f"no two training episodes can be compared in '{name}' (for touch they must "
+                    "share an object): give more, or leave it out of --modalities"
+                )
+            share = separated[name] = float(np.mean(ends < starts))
+            first, last = start[name], goal[name] = float(np.median(starts)), float(np.median(ends))
+            if share < MIN_SEPARATED or first - last < MIN_GAP:
+                raise UserError(
+                    f"the training episodes do not separate start from end in '{name}': the end is "
+                    f"nearer the goal in {share:.0%} of {len(starts)} pairs (needed "
+                    f"{MIN_SEPARATED:.0%}), median distance {first:.4f} at the start and {last:.4f} "
+                    "at the end; leave it out of --modalities, or take episodes that end in the "
+                    "goal state"
+                )
+    about = episodes[0].made_with, scene, len(episodes), portable(command_line())
+    return DistanceNormalizer(start, goal, fit_units(episodes), separated, *about)
 
 
 def fit_units(episodes: Sequence[EmbeddedEpisode]) -> dict[str, float]:
@@ -80,27 +91,6 @@ def fit_units(episodes: Sequence[EmbeddedEpisode]) -> dict[str, float]:
         name: max(float(np.mean(spread)), SMALLEST_UNIT.get(name, SMALLEST_UNIT["front"]))
         for name, spread in spreads.items()
     }
-
-
-def _check_separation(
-    name: str, starts: Float[np.ndarray, " pairs"], ends: Float[np.ndarray, " pairs"]
-) -> float:
-    """Return the share of pairs whose end is nearer than the start; UserError if it is too low."""
-    if not len(starts):
-        raise UserError(
-            f"no two training episodes can be compared in '{name}' (for touch they must share an "
-            "object): give more, or leave it out of --modalities"
-        )
-    share = float(np.mean(ends < starts))
-    start, end = float(np.median(starts)), float(np.median(ends))
-    if share < MIN_SEPARATED or start - end < MIN_GAP:
-        raise UserError(
-            f"the training episodes do not separate start from end in '{name}': the end is nearer "
-            f"the goal in {share:.0%} of {len(starts)} pairs (needed {MIN_SEPARATED:.0%}), median "
-            f"distance {start:.4f} at the start and {end:.4f} at the end; leave it out of "
-            f"--modalities, or take episodes that end in the goal state"
-        )
-    return share
 
 
 def _check_training(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality]) -> None:
@@ -136,18 +126,12 @@ def _training_distances(
             goals = [o for o in goals if o.object == e.object]
         if not goals and modality != "text":
             continue
-        d = _distances_to_goals(e, goals, modality)
+        if modality == "text":
+            d = text_distances(e.features[TOUCH], e.descriptions)
+        elif modality == "image":
+            d = cosine_distances(e.features[IMAGE], last_rows(goals)[IMAGE])
+        else:
+            d = touch_distances(e.features[TOUCH], last_rows(goals)[TOUCH])
         starts.append(np.median(d[:START_FRAMES], axis=0))
         ends.append(np.median(d[-1 - END_FRAMES : -1], axis=0))
     return np.concatenate([[], *starts]), np.concatenate([[], *ends])
-
-
-def _distances_to_goals(
-    episode: EmbeddedEpisode, goals: Sequence[EmbeddedEpisode], modality: Modality
-) -> Float[np.ndarray, "n g"]:
-    if modality == "text":
-        return text_distances(episode.features[TOUCH], episode.descriptions)
-    ends = last_rows(goals)
-    if modality == "image":
-        return cosine_distances(episode.features[IMAGE], ends[IMAGE])
-    return touch_distances(episode.features[TOUCH], ends[TOUCH])

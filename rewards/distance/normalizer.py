@@ -32,12 +32,14 @@ class EmbeddingSource:
     encoder: str = ""  # hash of the touch encoder's weights and preprocessor; "" without touch
     sensor: str = ""  # name of the fingertip sensor; "" without touch
 
-    def mismatch(self, other: "EmbeddingSource") -> str | None:
+    def mismatch(
+        self, other: "EmbeddingSource", images: bool = True, touch: bool = True
+    ) -> str | None:
         """Return why embeddings of another source cannot be compared with these; None if they can.
 
         A plain video counts as taken by the camera here; what one of them lacks is not compared.
         """
-        for what in ("towers", "camera", "sensor", "encoder"):
+        for what in ("towers", "camera") * images + ("sensor", "encoder") * touch:
             mine, theirs = getattr(self, what), getattr(other, what)
             if mine and theirs and mine != theirs:
                 return f"its {what} is {mine}, not {theirs}"
@@ -92,22 +94,12 @@ class DistanceNormalizer:
         A plain video counts as taken by the camera that the normalizer was fitted on. The goal of a
         modality in `same_episode` is a frame of the measured episode itself.
         """
-        mine, names = self.source, set(modalities) - {"force"}
+        names = set(modalities) - {"force"}
         for m in sorted(names):
             if (name := median_name(m, m in same_episode)) not in self.start:
                 return f"it has no '{name}', only {', '.join(self.start)}"
-        pairs = []
-        if "image" in names:
-            pairs.append(("towers", mine.towers, source.towers))
-            if source.camera:
-                pairs.append(("camera", mine.camera, source.camera))
-        if names & {"tactile", "text"}:
-            pairs.append(("sensor", mine.sensor, source.sensor))
-            pairs.append(("touch encoder", mine.encoder, source.encoder))
-        for what, fitted, measured in pairs:
-            if fitted != measured:
-                return f"it was fitted with the {what} {fitted or 'unknown'}, not {measured}"
-        return None
+        reason = self.source.mismatch(source, "image" in names, bool(names & {"tactile", "text"}))
+        return reason and f"it was fitted with other embeddings: {reason}"
 
     def normalise(
         self,

@@ -24,7 +24,7 @@ fused cost.
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Bool, Float, Float16, Float32
+from jaxtyping import Float, Float16, Float32
 from scipy.signal import lfilter
 
 from touchgoal.rewards.curves import FUSED, UNITS_AT_HALF
@@ -74,7 +74,14 @@ def part_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndarray
             distances[_WRIST_MAP] = map_distances(mine[_WRIST_MAP], goal[_WRIST_MAP])
     if TOUCH in goal and "held" in goal and "held" in mine:
         distances["object"] = object_distances(mine[TOUCH], goal[TOUCH])
-        distances |= contact_distances(mine, goal)
+        apart = mine["held"][:, None] != goal["held"]
+        distances["held"] = apart.any(-1).astype(np.float64)
+        if "centre" in mine and "centre" in goal:
+            away = np.linalg.norm(mine["centre"][:, None] - goal["centre"], axis=-1)
+            distances["centre"] = np.where(apart, _NO_CONTACT, away).mean(-1).astype(np.float64)
+        if "slip" in mine:
+            slip = mine["slip"].astype(np.float64).mean(1)
+            distances["slip"] = np.repeat(slip[:, None], len(goal["held"]), axis=1)
     if FORCE in goal and FORCE in mine:
         distances[FORCE] = force_distances(mine[FORCE], goal[FORCE])
     if "wrench" in goal and "wrench" in mine:
@@ -108,27 +115,14 @@ def object_distances(
 ) -> Float[np.ndarray, "n g"]:
     """Return half the squared distance of embeddings: 1 - cos for unit vectors, 0 for equal ones."""
     mine, theirs = (np.square(t, dtype=np.float64).sum(-1).mean(1) for t in (touch, goals))
-    return (mine[:, None] + theirs) / 2 - mean_products(touch, goals)
+    return (mine[:, None] + theirs) / 2 - 1 + touch_distances(touch, goals)
 
 
-def mean_products(
+def touch_distances(
     touch: Float32[np.ndarray, "n sides k"], goals: Float32[np.ndarray, "g sides k"]
 ) -> Float[np.ndarray, "n g"]:
-    """Return the dot product of each touch with each goal's same fingertip, mean over them."""
-    return np.einsum("nsk,gsk->ng", touch, goals, dtype=np.float64) / touch.shape[1]
-
-
-def contact_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndarray, "n g"]]:
-    """Return the distances of centre (m), slip (m), and of being held (0 or 1)."""
-    apart = mine["held"][:, None] != goal["held"]
-    distances = {"held": apart.any(-1).astype(np.float64)}
-    if "centre" in mine and "centre" in goal:
-        away = np.linalg.norm(mine["centre"][:, None] - goal["centre"], axis=-1)
-        distances["centre"] = np.where(apart, _NO_CONTACT, away).mean(-1).astype(np.float64)
-    if "slip" in mine:
-        slip = mine["slip"].astype(np.float64).mean(1)
-        distances["slip"] = np.repeat(slip[:, None], len(goal["held"]), axis=1)
-    return distances
+    """Return 1 - the dot product of each touch with each goal's same fingertip, mean over them."""
+    return 1 - np.einsum("nsk,gsk->ng", touch, goals, dtype=np.float64) / touch.shape[1]
 
 
 def force_distances(
@@ -159,8 +153,9 @@ def part_costs(mine: Features, goal: Features, units: Mapping[str, float]) -> Co
     if "held" not in mine:
         return costs
     touching = mine["held"].max(axis=1)
-    wanted = bool(goal["held"].any()) if "held" in goal else True  # a force is a touch
-    gated = {k: gate(c, touching, wanted) for k, c in costs.items() if k in TOUCH_PARTS}
+    # without contact it is 1, or 0 if the goal is without, too; a force is a touch
+    free = float(goal["held"].any()) if "held" in goal else 1.0
+    gated = {k: np.where(touching, c, free) for k, c in costs.items() if k in TOUCH_PARTS}
     return costs | gated
 
 
@@ -175,13 +170,6 @@ def goal_spread(goal: Features) -> dict[str, float]:
             others = d[~np.eye(n, dtype=bool)].reshape(n, n - 1)
             spread[name] = float(np.quantile(soft_minimum(others), SPREAD_QUANTILE))
     return spread
-
-
-def gate(
-    cost: Float[np.ndarray, " n"], touching: Bool[np.ndarray, " n"], goal_touches: bool
-) -> Float[np.ndarray, " n"]:
-    """Return a fingertip part's cost; without contact it is 1, or 0 if the goal is without, too."""
-    return np.where(touching, cost, float(goal_touches))
 
 
 def smooth_and_fuse(

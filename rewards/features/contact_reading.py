@@ -1,20 +1,16 @@
 """Contact of each fingertip frame by frame: whether it touches, how hard, where, and slip."""
 
-from collections.abc import Mapping
+from functools import partial
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
-from touchgoal.control.arrays import Image, Images
-from touchgoal.control.features import TACTILE, TRUTH_CONTACT
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.force import contact_centre, estimate_force
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import SensorModel
-from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.touches import ContactStream, contact_detector
-from touchgoal.rewards.curves import Contact
+from touchgoal.episodes.touches import contact_detector
 
 _CELL = 8  # px, finest cells of the depth map: a third of the time of 2 (`DepthEstimator`)
 _SETTLES = 0.4  # s of contact in which a grasp settles; validation: AUC of slips .93, without .91
@@ -34,13 +30,14 @@ class ContactReader:
         """Take the sensor model, None for an unknown sensor, frames without contact, and the rate."""
         self._sensor, self._slip = sensor, SlipMeter(fps)
         self._depth: DepthEstimator | None = None
-        self._pitch, self._size = 0.0, untouched.shape[2:0:-1]
+        self._pitch, size = 0.0, untouched.shape[2:0:-1]
         if sensor is not None:
             calibration = load(sensor.sensor_file)
             if not sensor.images_only:
                 self._depth = DepthEstimator(calibration, _CELL)
             self._pitch = calibration.pixel_pitch
-            self._size = calibration.background.shape[1::-1]
+            size = calibration.background.shape[1::-1]
+        self._resized = partial(cv2.resize, dsize=size, interpolation=cv2.INTER_AREA)
         self._detector = contact_detector(np.stack([self._resized(f) for f in untouched]))
 
     def read(self, frames: UInt8[np.ndarray, "n h w 3"]) -> dict[str, np.ndarray]:
@@ -49,30 +46,21 @@ class ContactReader:
         Of a sensor without a calibration file, or a computed one, whether it touches alone.
         """
         held, force, centre, slip = [], [], [], []
-        for frame in frames:
-            touching, f, c = self._read_frame(self._resized(frame))
-            held.append(touching)
-            force.append(f)
-            centre.append(c)
-            slip.append(self._slip.update(touching, c))
-        readings = {"held": np.array(held)}
-        if self._depth is None:
-            return readings
-        numbers = {"force": force, "centre": centre, "slip": slip}
-        return readings | {name: np.array(n, np.float32) for name, n in numbers.items()}
-
-    def _read_frame(self, frame: Image) -> tuple[bool, float, tuple[float, float]]:
-        touching = self._detector.update(frame)
-        if self._depth is None or self._sensor is None or not touching:
-            return touching, 0.0, (0.0, 0.0)
-        depth = self._depth.estimate(frame, self._detector.background.steady)
-        force = estimate_force(depth, self._pitch, self._sensor)
-        return touching, force, contact_centre(depth, self._pitch)
-
-    def _resized(self, frame: Image) -> Image:
-        if frame.shape[1::-1] == self._size:
-            return frame
-        return cv2.resize(frame, self._size, interpolation=cv2.INTER_AREA)
+        for frame in map(self._resized, frames):
+            held.append(self._detector.update(frame))
+            if self._depth is None or self._sensor is None:
+                continue
+            newtons, middle = 0.0, (0.0, 0.0)
+            if held[-1]:
+                depth = self._depth.estimate(frame, self._detector.background.steady)
+                newtons = estimate_force(depth, self._pitch, self._sensor)
+                middle = contact_centre(depth, self._pitch)
+            force.append(newtons)
+            centre.append(middle)
+            slip.append(self._slip.update(held[-1], middle))
+        numbers = {"force": force, "centre": centre, "slip": slip} if self._depth else {}
+        readings = {name: np.array(values, np.float32) for name, values in numbers.items()}
+        return {"held": np.array(held)} | readings
 
 
 class SlipMeter:
@@ -104,33 +92,3 @@ class SlipMeter:
         self._held, self._free = self._held + 1, 0
         self._slip = float(np.linalg.norm(now - self._grasp))
         return self._slip
-
-
-class ContactSearch:
-    """Search for the first contact over consecutive chunks of an episode.
-
-    It takes the simulator's truth, else detects contact in the tactile images by comparing with those
-    given as untouched, else with the first frames, which must be free of contact.
-    """
-
-    def __init__(self, untouched: Mapping[str, Images]) -> None:
-        self.contact = Contact(None, "no touch")
-        self._streams = {key: ContactStream(frames) for key, frames in untouched.items()}
-        self._frames = 0
-
-    def update(self, chunk: Episode) -> Contact:
-        """Search the next frames, at first at least 5; return the first contact so far."""
-        truth = chunk.frames.get(TRUTH_CONTACT)
-        sides = [key for key in TACTILE if key in chunk.frames]
-        if self.contact.frame is None and (truth is not None or sides):
-            touching = truth if truth is not None else self._detect(chunk, sides)
-            frames = np.flatnonzero(touching.any(axis=1))
-            first = self._frames + int(frames[0]) if len(frames) else None
-            self.contact = Contact(first, "detected" if truth is None else "truth")
-        self._frames += len(chunk)
-        return self.contact
-
-    def _detect(self, chunk: Episode, sides: list[str]) -> Bool[np.ndarray, "n sides"]:
-        streams = [self._streams.setdefault(key, ContactStream()) for key in sides]
-        pairs = zip(streams, sides, strict=True)
-        return np.stack([stream.update(chunk.frames[key]) for stream, key in pairs], axis=1)

@@ -15,6 +15,7 @@
 Without parts there are image and touch alone. Force, centre and slip need a sensor with a file.
 """
 
+import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,7 +30,7 @@ from touchgoal.control.features import IMAGE_PREFIX, TCP_POSE, WRENCH
 from touchgoal.episodes.schema import MetaValue
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
-from touchgoal.rewards.goals import Modality
+from touchgoal.rewards.goals import MODALITIES, Modality
 from touchgoal.runtime.atomic_write import atomic_write
 
 Features = Mapping[str, np.ndarray]
@@ -69,9 +70,8 @@ class EmbeddedEpisode:
     @property
     def modalities(self) -> tuple[Modality, ...]:
         """Modalities that a normalizer can be fitted to."""
-        there = (IMAGE in self.features, TOUCH in self.features, bool(len(self.descriptions)))
-        names: tuple[Modality, ...] = ("image", "tactile", "text")
-        return tuple(name for name, known in zip(names, there, strict=True) if known)
+        there = (IMAGE in self.features, TOUCH in self.features, len(self.descriptions) > 0)
+        return tuple(itertools.compress(MODALITIES, there))
 
     def with_facts(self, meta: Mapping[str, MetaValue]) -> "EmbeddedEpisode":
         """Return the trajectory with the object and the outcome that its meta name."""

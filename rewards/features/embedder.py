@@ -20,8 +20,9 @@ from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import OfflineTowers, Towers
 from touchgoal.episodes.schema import Episode, MetaValue, is_camera
 from touchgoal.episodes.touches import check_touch, touch_background
+from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
-from touchgoal.rewards.features.contact_reading import ContactReader, ContactSearch
+from touchgoal.rewards.features.contact_reading import ContactReader
 from touchgoal.rewards.features.embedded import (
     ARM,
     IMAGE,
@@ -47,6 +48,7 @@ from touchgoal.rewards.goals import (
     Goals,
     GoalSpec,
     GripForce,
+    Modality,
     OwnFrame,
     Sentence,
     TouchArrays,
@@ -86,15 +88,12 @@ class EpisodeEmbedder:
             parts: embed everything that the parts of a cost need: both cameras, their maps, and the
                 contact of the fingertips; else one camera and touch.
         """
-        self._towers = towers
-        self.encoder = encoder
+        self._towers, self.encoder = towers, encoder
         self._aligned = encoder if encoder is not None and encoder.towers else None
         self.knows_words = self._aligned is not None  # touch can be compared with sentences
         self.camera, self.parts = camera, parts
-        self._ends: dict[Bank | GoalFile, SuccessfulEnds] = {}
-        self._goals: dict[
-            tuple[EpisodeEnd, tuple[str, ...]], Features
-        ] = {}  # by keys that are read
+        # by the keys that are read, too
+        self._ends: dict[tuple[EpisodeEnd | Bank | GoalFile, tuple[str, ...]], SuccessfulEnds] = {}
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
         self._images_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
         self.made_with = self._images_with  # of episodes with touch, if there is an encoder
@@ -143,15 +142,21 @@ class EpisodeEmbedder:
                 f"{source} starts in contact, so its fingertips have no background; record it "
                 f"with {START_FRAMES} frames before the first touch"
             )
-        apart = untouched or {}
-        stream = self.stream({**first.frames, **apart}, fps, source)
-        search, pieces = ContactSearch(apart), []
+        stream = self.stream({**first.frames, **(untouched or {})}, fps, source)
+        truths, pieces = [], []
         for chunk in chain([first], following):
-            search.update(chunk)
+            truths += [] if truth is None else [chunk.frames[TRUTH_CONTACT]]
             pieces.append(stream.embed(chunk.frames, touch))
-        features = join_rows([piece.features for piece in pieces])
-        embedded = replace(pieces[0], features=features, contact=search.contact)
-        return embedded.with_facts(first.meta)
+        features = dict(join_rows([piece.features for piece in pieces]))
+        touching = features.get("held") if truth is None else np.concatenate(truths)
+        contact = Contact(None, "no touch")
+        if touching is not None:
+            frames = np.flatnonzero(touching.any(axis=1))
+            first_frame = int(frames[0]) if len(frames) else None
+            contact = Contact(first_frame, "detected" if truth is None else "truth")
+        if not self.parts:
+            features.pop("held", None)
+        return replace(pieces[0], features=features, contact=contact).with_facts(first.meta)
 
     def describe(self, embedded: EmbeddedEpisode, meta: Mapping[str, MetaValue]) -> EmbeddedEpisode:
         """Add the sentences about an episode, if touch knows words.
@@ -197,9 +202,9 @@ class EpisodeEmbedder:
         """
         features: dict[str, np.ndarray] = {}
         if "image" in goals:
-            features |= self._goal_of_images(goals["image"], own)
+            features |= self._embed_goal("image", goals["image"], own)[0]
         if "tactile" in goals:
-            features |= self._goal_of_touch(goals["tactile"], own)
+            features |= self._embed_goal("tactile", goals["tactile"], own)[1]
         if isinstance(text := goals.get("text"), Sentence):
             features[TEXT] = self.embed_sentences([text.text])
             if text.baseline:
@@ -212,14 +217,15 @@ class EpisodeEmbedder:
     def embed_cameras(self, frames: Frames) -> Features:
         """Return image, and with parts the pooled features and map of each camera."""
         if not self.parts:
-            return {IMAGE: self._embed_images(frames[self.camera])} if self.camera in frames else {}
+            images = frames.get(self.camera)
+            return {} if images is None else {IMAGE: _unit(self._towers.embed_images(images))}
         features: dict[str, np.ndarray] = {}
         for key in dict.fromkeys((*CAMERAS, self.camera)):
             if key in frames and isinstance(self._towers, OfflineTowers):
                 pooled, features[map_name(key)] = self._towers.embed_with_maps(frames[key])
                 features[camera_name(key)] = _unit(pooled)
             elif key in frames:
-                features[camera_name(key)] = self._embed_images(frames[key])
+                features[camera_name(key)] = _unit(self._towers.embed_images(frames[key]))
         if self.camera in frames:
             features[IMAGE] = features[camera_name(self.camera)]
         return features
@@ -243,59 +249,47 @@ class EpisodeEmbedder:
         assert self._aligned is not None  # without it no modality takes a sentence
         return self._aligned.embed_text_goal(list(sentences), self._towers)
 
-    def _embed_images(self, frames: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, "n d"]:
-        return _unit(self._towers.embed_images(frames))
-
-    def _goal_of_images(self, spec: GoalSpec, own: EmbeddedEpisode) -> Features:
-        main = self.camera or FRONT
+    def _embed_goal(
+        self, modality: Modality, spec: GoalSpec, own: EmbeddedEpisode
+    ) -> tuple[Features, Features]:
+        """Return the features of a goal of images, and those of a goal of touch."""
         if isinstance(spec, Sentence):
             assert self._towers.pretrained_together  # or a sentence is no goal for images
-            return {IMAGE: _unit(self._towers.embed_texts([spec.text]))}
+            return {IMAGE: _unit(self._towers.embed_texts([spec.text]))}, {}
         if isinstance(spec, GoalImage):
-            return self.embed_cameras({main: spec.read()})
-        if isinstance(spec, EpisodeEnd):
-            key = spec, tuple(k for k in CAMERAS if camera_name(k) in own.features)
-            if key not in self._goals:
-                frames = spec.read((main,), also=key[1]).frames
-                last = {k: v[-1:] for k, v in frames.items() if is_camera(k)}
-                self._goals[key] = self.embed_cameras(last)
-            return self._goals[key]
-        assert isinstance(spec, OwnFrame | Bank | GoalFile)
-        return split_features(self._end(spec, own))[0]
-
-    def _goal_of_touch(self, spec: GoalSpec, own: EmbeddedEpisode) -> Features:
-        if isinstance(spec, OwnFrame | Bank | GoalFile):
-            return split_features(self._end(spec, own))[1]
-        if isinstance(spec, EpisodeEnd):
-            key = spec, own.sides
-            if key not in self._goals:
-                read = replace(spec.read(own.sides), meta={})
-                embedded = self.embed_episode(read, own.fps, str(spec))
-                self._goals[key] = split_features(last_rows([embedded]))[1]
-            return self._goals[key]
-        assert isinstance(spec, TouchArrays)
-        frames = {
-            side: np.stack([*[spec.backgrounds[side]] * START_FRAMES, spec.images[side]])
-            for side in own.sides
-        }
-        end = self.stream(frames, own.fps, str(spec)).embed(frames)
-        return split_features(last_rows([end]))[1]
-
-    def _end(self, spec: OwnFrame | Bank | GoalFile, own: EmbeddedEpisode) -> Features:
-        """Return a frame of the trajectory, or the ends of successes, which are embedded once."""
+            return self.embed_cameras({self.camera or FRONT: spec.read()}), {}
         if isinstance(spec, OwnFrame):
             row = frame_index(spec, len(own), own.source)
-            return take_rows(own.features, slice(row, row + 1))
-        if spec not in self._ends:
-            self._ends[spec] = self._embed_ends(spec, own)
-        return self._ends[spec].for_trajectory(own, str(spec))
+            return split_features(take_rows(own.features, slice(row, row + 1)))
+        if isinstance(spec, TouchArrays):
+            frames = {
+                side: np.stack([*[spec.backgrounds[side]] * START_FRAMES, spec.images[side]])
+                for side in own.sides
+            }
+            end = self.stream(frames, own.fps, str(spec)).embed(frames)
+            return split_features(last_rows([end]))
+        assert isinstance(spec, EpisodeEnd | Bank | GoalFile)
+        cameras = tuple(
+            key
+            for key in dict.fromkeys((self.camera, *CAMERAS))
+            if key == self.camera or camera_name(key) in own.features
+        )
+        keys = (*cameras, *own.sides)
+        if isinstance(spec, EpisodeEnd):  # which may lack what other goals are for
+            keys = own.sides if modality == "tactile" else cameras
+        if (known := (spec, keys)) not in self._ends:
+            self._ends[known] = self._embed_ends(spec, keys, own.fps)
+        ends = self._ends[known]
+        if isinstance(spec, EpisodeEnd):
+            return split_features(ends.features)
+        return split_features(ends.for_trajectory(own, str(spec)))
 
-    def _embed_ends(self, spec: Bank | GoalFile, own: EmbeddedEpisode) -> SuccessfulEnds:
+    def _embed_ends(
+        self, spec: EpisodeEnd | Bank | GoalFile, keys: tuple[str, ...], fps: float
+    ) -> SuccessfulEnds:
         if isinstance(spec, GoalFile):
             return SuccessfulEnds.load(spec.path)
-        seen = [key for key in CAMERAS if camera_name(key) in own.features]
-        keys = (*((self.camera,) if self.camera else ()), *own.sides)
-        ends = [self.embed_episode(e.read(keys, seen), own.fps, str(e)) for e in spec.ends()]
+        ends = [self.embed_episode(end.read(also=keys), fps, str(end)) for end in spec.ends()]
         return SuccessfulEnds.of(ends)
 
 
@@ -307,13 +301,11 @@ class FeatureStream:
         self._embedder, self._about = embedder, about
         untouched = {side: untouched_frames(first[side]) for side in about.sides}
         self._backgrounds = {side: touch_background(frames) for side, frames in untouched.items()}
-        sensor = SENSORS.get(embedder.made_with.sensor)
+        sensor = SENSORS.get(embedder.made_with.sensor) if embedder.parts else None
         # newest frames of each side, for encoders of several
         self._past: dict[str, np.ndarray] = {}
         self._readers = {
-            side: ContactReader(sensor, frames, about.fps)
-            for side, frames in untouched.items()
-            if embedder.parts
+            side: ContactReader(sensor, frames, about.fps) for side, frames in untouched.items()
         }
 
     def embed(self, frames: Frames, touch: bool = True) -> EmbeddedEpisode:

@@ -8,6 +8,7 @@ reward-weighted training and its overlay videos read, `progress_sparse`.
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from touchgoal.runtime.atomic_write import atomic_write
 FRAMES, PROGRESS = "frames.parquet", "touchgoal_progress.parquet"
 _METADATA = "lerobot.reward_scoring."  # LeRobot's rewards/scoring, format version 1
 _INDEX = [pa.field(k, pa.int64(), False) for k in ("index", "episode_index", "frame_index")]
-_TIME, _NEXT_REWARD = "timestamp", "next.reward"
+_TIME, _NEXT_REWARD, _PROGRESS = "timestamp", "next.reward", "progress_sparse"
 _MEANING = {  # beginning of a column's name -> meaning, and whether higher or lower is better
     COST: ("distance to the goal, 0 at the goal", "lower"),
     REWARD: ("-cost", "higher"),
@@ -49,41 +50,36 @@ def write_frames(
         "descriptors": {name: _describe(name, facts[0]) for name in signals},
         "episode_indices": [one.index for one in facts],
     }
-    schema = pa.schema(fields, {f"{_METADATA}{k}": _canonical(v) for k, v in metadata.items()})
+    canonical = partial(json.dumps, sort_keys=True, separators=(",", ":"))
+    schema = pa.schema(fields, {f"{_METADATA}{k}": canonical(v) for k, v in metadata.items()})
     _write(out / FRAMES, schema, (_rows(Record.load(path), names) for path in paths))
 
 
 def write_progress(paths: Sequence[Path], out: Path) -> None:
     """Write `touchgoal_progress.parquet` from normalised records: 1 - cost of the main curve."""
-    schema = pa.schema([*_INDEX, pa.field("progress_sparse", pa.float32(), False)])
-    _write(out / PROGRESS, schema, (_progress(Record.load(path)) for path in paths))
+    schema = pa.schema([*_INDEX, pa.field(_PROGRESS, pa.float32(), False)])
+    _write(out / PROGRESS, schema, (_rows(Record.load(path), ()) for path in paths))
 
 
 def _write(path: Path, schema: pa.Schema, tables: Iterator[dict[str, np.ndarray]]) -> None:
     with atomic_write(path) as unfinished, pq.ParquetWriter(unfinished, schema) as writer:
         for columns in tables:
-            arrays = [pa.array(columns[field.name], field.type) for field in schema]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
-
-
-def _index(facts: Facts) -> dict[str, np.ndarray]:
-    frames = np.arange(facts.frames)
-    episode = np.full(facts.frames, facts.index)
-    return {"index": facts.offset + frames, "episode_index": episode, "frame_index": frames}
+            writer.write_table(pa.Table.from_pydict(columns, schema))
 
 
 def _rows(record: Record, names: Sequence[str]) -> dict[str, np.ndarray]:
-    n, facts = record.facts.frames, record.facts
-    missing = np.full(n, np.nan)
-    values = {_signal(name): record.columns.get(name, missing) for name in names}
-    step = record.columns[f"{POTENTIAL}{main_curve(record.costs)}"]
-    time = {_TIME: np.arange(n) / facts.fps, _NEXT_REWARD: np.append(step[1:], 0.0)}
-    return _index(facts) | time | values
-
-
-def _progress(record: Record) -> dict[str, np.ndarray]:
-    cost = record.costs[main_curve(record.costs)]
-    return _index(record.facts) | {"progress_sparse": np.clip(1 - cost, 0, 1)}
+    """Return all columns of a trajectory."""
+    facts, columns = record.facts, record.columns
+    frames, missing = np.arange(facts.frames), np.full(facts.frames, np.nan)
+    main = main_curve(record.costs)
+    index = facts.offset + frames, np.full(facts.frames, facts.index), frames
+    return {
+        **dict(zip((field.name for field in _INDEX), index, strict=True)),
+        _TIME: frames / facts.fps,
+        **{_signal(name): columns.get(name, missing) for name in names},
+        _NEXT_REWARD: np.append(columns[f"{POTENTIAL}{main}"][1:], 0.0),
+        _PROGRESS: np.clip(1 - record.costs[main], 0, 1),
+    }
 
 
 def _signal(column: str) -> str:
@@ -109,7 +105,3 @@ def _describe(signal: str, facts: Facts) -> dict[str, Any]:
         "comparison_scope": "dataset" if facts.normalised else "episode",
         "allow_nan": direction != "none",
     }
-
-
-def _canonical(value: Any) -> str:
-    return json.dumps(value, sort_keys=True, separators=(",", ":"))

@@ -21,7 +21,6 @@ from touchgoal.rewards.report.plot import line_styles
 from touchgoal.rewards.report.record import Facts, Record
 from touchgoal.rewards.report.tables import COLUMNS
 from touchgoal.rewards.report.thumbnails import COLUMNS as SHEET_COLUMNS
-from touchgoal.rewards.report.thumbnails import last_of
 from touchgoal.runtime.atomic_write import write_file
 
 PAGE = "report.html"
@@ -39,44 +38,64 @@ def write_pages(
 
     `tables` are printed above the table of trajectories, each with its title as its first line.
     """
-    groups = [range(i, min(i + PER_PAGE, len(facts))) for i in range(0, len(facts), PER_PAGE)]
-    names = [PAGE] if len(groups) == 1 else [f"report_{k + 1:03d}.html" for k in range(len(groups))]
-    thumbs: list[str] = []
-    for name, group in zip(names, groups, strict=True):
-        loaded = [Record.load(records[i]) for i in group]
-        thumbs += [_thumb(record) for record in loaded]
-        some = [record.facts for record in loaded]
-        links = names if len(groups) > 1 else []
-        content = _content(facts, [_viewed(record) for record in loaded])
-        write_file(out / name, _fill(content, facts, some, links, tables).encode())
-    if len(groups) > 1:
-        page_of = [name for name, group in zip(names, groups, strict=True) for _ in group]
-        rows = [
-            _row(f) | {"thumb": thumb, "page": f"{page}#{f.name}"}
-            for f, thumb, page in zip(facts, thumbs, page_of, strict=True)
+    starts = range(0, len(facts), PER_PAGE)
+    names = [f"report_{k + 1:03d}.html" for k in range(len(starts))] if len(starts) > 1 else []
+    rows: list[dict[str, Any]] = []
+    for start, name in zip(starts, names or [PAGE], strict=True):
+        loaded = [Record.load(path) for path in records[start : start + PER_PAGE]]
+        page = _page(facts, list(map(_viewed, loaded)), names, tables)
+        write_file(out / name, page.encode())
+        rows += [
+            _row(r.facts) | {"thumb": data_uri(r.thumb.tobytes()), "page": f"{name}#{r.facts.name}"}
+            for r in loaded
         ]
-        page = _fill(_content(facts, rows), facts, facts, names, tables)
-        write_file(out / PAGE, page.encode())
+    if names:
+        write_file(out / PAGE, _page(facts, rows, names, tables).encode())
     return out / PAGE
 
 
-def _fill(
-    content: Mapping[str, Any],
+def _page(
     facts: Sequence[Facts],
-    some: Sequence[Facts],
+    episodes: Sequence[Mapping[str, Any]],
     pages: Sequence[str],
     tables: Sequence[str],
 ) -> str:
     goals = sorted({goal for f in facts for goal in f.goal.values()})
     listed = ", ".join(goals[:3]) + (f" and {len(goals) - 3} more" if len(goals) > 3 else "")
-    frames = sum(f.frames for f in some)
     links = [f'<a href="{PAGE}">all</a>'] if pages else []
     links += [f'<a href="{page}">{k + 1}</a>' for k, page in enumerate(pages)]
-    number = f"{len(some)} trajectories" if len(some) > 1 else "1 trajectory"
+    number = f"{len(episodes)} trajectories" if len(episodes) > 1 else "1 trajectory"
+    frames = f"{sum(e['frames'] for e in episodes):,} frames"
+    names = list(dict.fromkeys(name for f in facts for name in f.measured))
+    words = [
+        {"key": key, "label": label, "word": True}
+        for key, label in _WORDS.items()
+        if any(getattr(f, key) for f in facts)
+    ]
+    metrics = [
+        {
+            "key": field,
+            "label": header,
+            "meaning": meaning,
+            "metric": True,
+            "digits": 0 if field in _WHOLE else 2,
+        }
+        for header, (field, meaning) in COLUMNS.items()
+        if any(m[field] is not None for f in facts for m in f.measured.values())
+    ]
+    content = {
+        "curves": names,
+        "main": main_curve(names),
+        "styles": line_styles(names),
+        "unit": facts[0].unit,
+        "levels": reference_levels(names, facts[0].normalised),
+        "columns": [*words, {"key": "frames", "label": "frames", "digits": 0}, *metrics],
+        "episodes": episodes,
+    }
     return Template((_FILES / "page.html").read_text()).substitute(
-        title=html.escape(f"Reward curves: {some[0].source}"),
+        title=html.escape(f"Reward curves: {episodes[0]['source']}"),
         heading="Reward curves",
-        subheading=html.escape(f"{number}, {frames:,} frames · goal: {listed} · {facts[0].unit}"),
+        subheading=html.escape(f"{number}, {frames} · goal: {listed} · {facts[0].unit}"),
         navigation=" ".join(links),
         style=(_FILES / "page.css").read_text(),
         script=(_FILES / "page.js").read_text(),
@@ -91,45 +110,12 @@ def _as_section(table: str) -> str:
     return f"<section><h2>{html.escape(title)}</h2><pre>{html.escape(rest)}</pre></section>"
 
 
-def _content(facts: Sequence[Facts], episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    names = list(dict.fromkeys(name for f in facts for name in f.measured))
-    words = [{"key": key, "label": label, "word": True} for key, label in _WORDS.items()]
-    used = [w for w in words if any(getattr(f, w["key"]) for f in facts)]
-    metrics = [
-        {
-            "key": field,
-            "label": header,
-            "meaning": meaning,
-            "metric": True,
-            "digits": 0 if field in _WHOLE else 2,
-        }
-        for header, (field, meaning) in COLUMNS.items()
-        if any(m[field] is not None for f in facts for m in f.measured.values())
-    ]
-    return {
-        "curves": names,
-        "main": main_curve(names),
-        "styles": line_styles(names),
-        "unit": facts[0].unit,
-        "levels": reference_levels(names, facts[0].normalised),
-        "columns": [*used, {"key": "frames", "label": "frames", "digits": 0}, *metrics],
-        "episodes": episodes,
-    }
-
-
 def _row(facts: Facts) -> dict[str, Any]:
-    fields = {field for field, _ in COLUMNS.values()}
-    return {
-        "name": facts.name,
-        "source": facts.source,
-        "object": facts.object,
-        "outcome": facts.outcome,
-        "frames": facts.frames,
-        "metrics": {
-            name: {k: _short(v) for k, v in values.items() if k in fields}
-            for name, values in facts.measured.items()
-        },
-    }
+    fields = [field for field, _ in COLUMNS.values()]
+    shown = ("name", "source", "object", "outcome", "frames")
+    measured = facts.measured.items()
+    metrics = {name: {k: _short(values[k]) for k in fields} for name, values in measured}
+    return {key: getattr(facts, key) for key in shown} | {"metrics": metrics}
 
 
 def _viewed(record: Record) -> dict[str, Any]:
@@ -154,11 +140,6 @@ def _sheet(sheet: np.ndarray, count: int) -> dict[str, Any]:
         width, height = image.width // columns, image.height // rows
     uri = data_uri(sheet.tobytes())
     return {"uri": uri, "columns": columns, "width": width, "height": height}
-
-
-def _thumb(record: Record) -> str:
-    sheet = next(iter(record.sheets.values()))
-    return data_uri(last_of(sheet, len(record.facts.shown)))
 
 
 def data_uri(jpeg: bytes) -> str:

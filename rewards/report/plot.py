@@ -84,10 +84,10 @@ def line_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     Colours are for the colour-blind, too; the dashes distinguish them in grey.
     """
     main, dashes = main_curve(names), cycle(_DASHES)
-    look = {n: ("-", 2.6) if n == main else (next(dashes), 1.8) for n in names}
-    fields = ("color", "linestyle", "linewidth")
+    thick, thin = {"linestyle": "-", "linewidth": 2.6}, {"linewidth": 1.8}
     return {
-        n: dict(zip(fields, (c, *look[n]), strict=True)) for n, c in curve_colors(names).items()
+        name: {"color": color} | (thick if name == main else thin | {"linestyle": next(dashes)})
+        for name, color in curve_colors(names).items()
     }
 
 
@@ -134,25 +134,17 @@ def _label_lines(
     """Name each line at its right end, outside the axes, moved apart where ends meet."""
     low, high = axes.get_ylim()
     names = sorted(values, key=lambda name: values[name][-1])
-    look: dict[str, Any] = {
-        "xycoords": "axes fraction",
-        "textcoords": "axes fraction",
-        "va": "center",
-    }
-    look |= {"annotation_clip": False, "fontsize": 12.5}
+    look: dict[str, Any] = dict.fromkeys(("xycoords", "textcoords"), "axes fraction")
+    look |= {"va": "center", "annotation_clip": False, "fontsize": 12.5}
     arrow = {"arrowstyle": "-", "linewidth": 0.8, "shrinkA": 1, "relpos": (0, 0.5)}
     ends = np.array([(values[name][-1] - low) / (high - low) for name in names])
-    for name, end, height in zip(names, ends, _spread_labels(ends, gap), strict=True):
+    rank = np.arange(len(ends)) * gap
+    spread = np.maximum.accumulate(ends - rank) + rank
+    heights = spread + np.mean(ends - spread)
+    for name, end, height in zip(names, ends, heights, strict=True):
         color, weight = styles[name]["color"], "bold" if styles[name]["linewidth"] > 2 else "normal"
         text, line = {"color": color, "fontweight": weight, **look}, {"color": color, **arrow}
         axes.annotate(name, (1, end), xytext=(1.045, height), arrowprops=line, **text)
-
-
-def _spread_labels(heights: np.ndarray, gap: float) -> np.ndarray:
-    """Return ascending heights moved apart to at least `gap`, about the same mean."""
-    rank = np.arange(len(heights)) * gap
-    spread = np.maximum.accumulate(heights - rank) + rank
-    return spread + np.mean(heights - spread)
 
 
 def _elide_middle(text: str, length: int) -> str:

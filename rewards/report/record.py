@@ -4,7 +4,6 @@ A measurement that goes on after an interruption reads it instead of measuring a
 are those of an uninterrupted one.
 """
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +12,14 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.features.embedded import load_features, save_features
 from touchgoal.rewards.metrics import CurveMetrics, find_peaks
 from touchgoal.rewards.report.thumbnails import Thumbnails
 from touchgoal.rewards.sources.trajectory import Trajectory
-from touchgoal.runtime.atomic_write import atomic_write
 
 COST, REWARD, POTENTIAL, RAW = "cost_", "reward_", "potential_reward_", "cosine_distance_"
 """Beginnings of the names of columns."""
-_COLUMN, _SHEET = "column/", "sheet/"
+_SHEET, _THUMB = "sheet/", "thumb"
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,8 @@ class Facts:
     peaks: dict[str, list[int]]  # frames of the bumps of each cost curve
     shown: list[int]  # frames that the images show
     columns: list[str]  # names of the values per frame
-    goal_untouched: bool = False  # whether it touches, and its goal of touch does not
+    # whether touch is near its goal before the first contact, and far from it later
+    goal_untouched: bool = False
 
     def metrics(self) -> dict[str, CurveMetrics]:
         """Return the metrics of each cost curve."""
@@ -60,6 +60,7 @@ class Record:
     facts: Facts
     columns: dict[str, Float[np.ndarray, " n"]]  # values per frame
     sheets: dict[str, UInt8[np.ndarray, " bytes"]]  # JPEG of each camera and fingertip
+    thumb: UInt8[np.ndarray, " thumb"]  # JPEG of the last frame
 
     @property
     def costs(self) -> dict[str, Float[np.ndarray, " n"]]:
@@ -68,35 +69,24 @@ class Record:
 
     def save(self, path: Path) -> None:
         """Write the record atomically."""
-        arrays: dict[str, Any] = {f"{_COLUMN}{key}": v for key, v in self.columns.items()}
-        arrays |= {f"{_SHEET}{key}": sheet for key, sheet in self.sheets.items()}
-        facts = np.array(json.dumps(asdict(self.facts)))
-        with atomic_write(path) as unfinished, unfinished.open("wb") as file:
-            np.savez_compressed(file, facts=facts, **arrays)
+        sheets = {f"{_SHEET}{key}": sheet for key, sheet in self.sheets.items()}
+        save_features(path, {**self.columns, **sheets, _THUMB: self.thumb}, asdict(self.facts))
 
     @classmethod
     def load(cls, path: Path) -> "Record":
         """Read a record that `save` wrote."""
-        with np.load(path) as file:
-            facts = Facts(**json.loads(str(file["facts"])))
-            columns, sheets = (
-                {key.removeprefix(kind): file[key] for key in file.files if key.startswith(kind)}
-                for kind in (_COLUMN, _SHEET)
-            )
-        return cls(facts, columns, sheets)
-
-
-def load_facts(path: Path) -> Facts:
-    """Read the facts of a record alone."""
-    with np.load(path) as file:
-        return Facts(**json.loads(str(file["facts"])))
+        arrays, facts = load_features(path)
+        columns, thumb = {k: arrays.pop(k) for k in facts["columns"]}, arrays.pop(_THUMB)
+        sheets = {key.removeprefix(_SHEET): sheet for key, sheet in arrays.items()}
+        return cls(Facts(**facts), columns, sheets, thumb)
 
 
 def record_of(curves: Curves, trajectory: Trajectory, thumbnails: Thumbnails) -> Record:
     """Return the record of a measured trajectory."""
     meta, metrics = trajectory.meta, curves.metrics()
     success = meta.get("success")
-    columns = columns_of(curves)
+    columns, contact = columns_of(curves), curves.contact
+    touch, first = curves.raw.get("tactile"), contact.frame
     facts = Facts(
         name=trajectory.name,
         source=curves.source,
@@ -108,8 +98,8 @@ def record_of(curves: Curves, trajectory: Trajectory, thumbnails: Thumbnails) ->
         normalised=bool(curves.normalised),
         goal=dict(curves.goal),
         own_goal=bool(curves.same_episode),
-        contact=curves.contact.frame,
-        contact_source=curves.contact.label_source,
+        contact=contact.frame,
+        contact_source=contact.label_source,
         object=str(meta.get("object", "")),
         outcome=str(meta.get("outcome") or {None: "", True: "success"}.get(success, "failure")),
         success=None if success is None else bool(success),
@@ -117,17 +107,11 @@ def record_of(curves: Curves, trajectory: Trajectory, thumbnails: Thumbnails) ->
         peaks={n: find_peaks(c, metrics[n].eps).tolist() for n, c in curves.costs.items()},
         shown=thumbnails.shown,
         columns=list(columns),
-        goal_untouched=_goal_untouched(curves),
+        goal_untouched=touch is not None
+        and "tactile" in curves.goal
+        and bool(first and np.median(touch[:first]) < touch[first:].max() / 2),
     )
-    return Record(facts, columns, thumbnails.sheets())
-
-
-def _goal_untouched(curves: Curves) -> bool:
-    """Return whether touch is near its goal before the first contact, and far from it later."""
-    touch, first = curves.raw.get("tactile"), curves.contact.frame
-    if touch is None or not first or "tactile" not in curves.goal:
-        return False
-    return bool(np.median(touch[:first]) < touch[first:].max() / 2)
+    return Record(facts, columns, thumbnails.sheets(), thumbnails.last())
 
 
 def columns_of(curves: Curves) -> dict[str, Float[np.ndarray, " n"]]:

@@ -1,6 +1,5 @@
 """Report of one trajectory (a plot, a CSV and a JSON), and of all that were measured."""
 
-import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -14,13 +13,8 @@ from touchgoal.rewards.curves import GAMMA, Curves
 from touchgoal.rewards.report.frame_table import PROGRESS, write_frames, write_progress
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.plot import plot
-from touchgoal.rewards.report.record import columns_of, load_facts
-from touchgoal.rewards.report.tables import (
-    MOST_CURVES,
-    ends_table,
-    metrics_table,
-    outcome_table,
-)
+from touchgoal.rewards.report.record import Record, columns_of
+from touchgoal.rewards.report.tables import MOST_CURVES, ends_table, metrics_table, outcome_table
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.json_file import write_json
 
@@ -64,7 +58,7 @@ def report_all(
     Args:
         audit: table of the touch-use audit; "" without one.
     """
-    facts = [load_facts(path) for path in records]
+    facts = [Record.load(path).facts for path in records]
     about = [{"source": f.source, "object": f.object, "outcome": f.outcome} for f in facts]
     write_json(out / "metrics.json", [a | f.measured for a, f in zip(about, facts, strict=True)])
     write_frames(records, facts, out, provenance)
@@ -120,11 +114,9 @@ def curves_csv(curves: Curves) -> str:
     Columns: frame, time (s); for every curve `cost_`, `reward_` (-cost) and `potential_reward_`
     (see `report_json`); `cosine_distance_` of every single modality.
     """
-    columns = columns_of(curves)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["frame", "time_s", *columns])
-    for t in range(len(curves)):
-        row = [f"{column[t]:.6f}" for column in columns.values()]
-        writer.writerow([t, f"{t / curves.fps:.4f}", *row])
+    frames = np.arange(len(curves))
+    columns = {"frame": frames, "time_s": frames / curves.fps, **columns_of(curves)}
+    formats = ["%d", "%.4f", *["%.6f"] * (len(columns) - 2)]
+    text, table = io.StringIO(), np.column_stack(list(columns.values()))
+    np.savetxt(text, table, formats, ",", header=",".join(columns), comments="")
     return text.getvalue()

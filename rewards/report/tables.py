@@ -86,16 +86,6 @@ def ends_table(facts: Sequence[Facts]) -> str:
     return "\n".join(lines)
 
 
-def _cell(values: list[float | int | None]) -> str:
-    defined = [v for v in values if v is not None]
-    if not defined:
-        return "-"
-    count = "" if len(defined) == len(values) else f" (n={len(defined)})"
-    if all(isinstance(v, int) for v in defined):
-        return f"{median_low(defined)}{count}"
-    return f"{mean(defined):.2f}{count}"
-
-
 def outcome_table(facts: Sequence[Facts]) -> str:
     """Return a table, its title first, with a row per curve: mean last cost of each outcome, and the AUC.
 
@@ -121,6 +111,16 @@ def outcome_table(facts: Sequence[Facts]) -> str:
         "  AUC       share of (failure, success) pairs in which the failure ends at the higher cost"
     )
     return "\n".join([_TITLE, *aligned(rows), legend])
+
+
+def _cell(values: list[float | int | None]) -> str:
+    defined = [v for v in values if v is not None]
+    if not defined:
+        return "-"
+    count = "" if len(defined) == len(values) else f" (n={len(defined)})"
+    if all(isinstance(v, int) for v in defined):
+        return f"{median_low(defined)}{count}"
+    return f"{mean(defined):.2f}{count}"
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:

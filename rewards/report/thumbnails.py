@@ -1,7 +1,6 @@
 """Small images of a trajectory, at most 32 frames, collected while it is read."""
 
 import io
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
@@ -55,17 +54,9 @@ class Thumbnails:
         """Return a JPEG of each camera and fingertip: its frames in rows of 8, from the top left."""
         return {name: _sheet(images) for name, images in self._images.items()}
 
-
-def last_of(sheet: UInt8[np.ndarray, " bytes"], count: int) -> bytes:
-    """Return the last of the `count` images of a sheet as a JPEG of its own."""
-    with Image.open(io.BytesIO(sheet.tobytes())) as image:
-        width, height = (
-            image.width // min(count, COLUMNS),
-            image.height // math.ceil(count / COLUMNS),
-        )
-        row, column = divmod(count - 1, COLUMNS)
-        box = column * width, row * height, (column + 1) * width, (row + 1) * height
-        return _jpeg(np.asarray(image.crop(box)))
+    def last(self) -> UInt8[np.ndarray, " bytes"]:
+        """Return the last frame of the first camera as a JPEG."""
+        return _jpeg(next(iter(self._images.values()))[-1])
 
 
 def _shrunk(image: UInt8[np.ndarray, "h w 3"], most: int) -> UInt8[np.ndarray, "y x 3"]:
@@ -75,16 +66,13 @@ def _shrunk(image: UInt8[np.ndarray, "h w 3"], most: int) -> UInt8[np.ndarray, "
 
 
 def _sheet(images: list[np.ndarray]) -> UInt8[np.ndarray, " bytes"]:
-    height, width, _ = images[0].shape
-    columns, rows = min(len(images), COLUMNS), math.ceil(len(images) / COLUMNS)
-    sheet = np.zeros((rows * height, columns * width, 3), np.uint8)
-    for i, image in enumerate(images):
-        row, column = divmod(i, COLUMNS)
-        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = image
-    return np.frombuffer(_jpeg(sheet), np.uint8)
+    columns = min(len(images), COLUMNS)
+    black = [np.zeros_like(images[0])] * (-len(images) % columns)
+    rows = np.stack([*images, *black]).reshape(-1, columns, *images[0].shape)
+    return _jpeg(np.concatenate([np.concatenate(row, axis=1) for row in rows]))
 
 
-def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
+def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, " bytes"]:
     file = io.BytesIO()
     Image.fromarray(image).save(file, "JPEG", quality=_QUALITY)
-    return file.getvalue()
+    return np.frombuffer(file.getvalue(), np.uint8)

@@ -57,53 +57,20 @@ def open_episodes(
     change places, or no episode left that can be measured.
     """
     episodes = EpisodeSet(root, complete=False, keys=keys)
-    _check_index(episodes, index)
+    if not len(episodes):
+        raise UserError(f"{root} has no episodes")
+    for i in index:
+        if not 0 <= i < len(episodes):
+            raise UserError(f"{root} has no episode {i}; it has 0 to {len(episodes) - 1}")
+        if index.count(i) > 1:
+            raise UserError(f"--index names episode {i} {index.count(i)} times: name it once")
     chosen = list(index or range(len(episodes)))
     touch = tuple(key for key in TACTILE if with_touch and key in episodes.features)
     camera = _find_camera(episodes, camera, bool(touch))
-    cameras = tuple(key for key in dict.fromkeys((*CAMERAS, camera)) if key in episodes.features)
-    read = tuple(
-        key for key in (*cameras, *touch, TRUTH_CONTACT, *ARM.values()) if key in episodes.features
-    )
-    found = _trajectories(episodes, chosen, read)
-    sensors = {str(t.meta["sensor"]) for t in found if t.meta.get("sensor")}
-    if len(sensors) > 1:
-        raise UserError(f"{root} mixes the sensors {', '.join(sorted(sensors))}: choose --index")
-    tasks = {episodes.task(i) for i in chosen}
-    if touch:
-        seen = {chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)}
-        if readable := [i for i in sorted(seen) if _reads(episodes, i, touch)]:
-            check_fingertips(episodes, readable)
-    faults = find_faults(episodes, chosen, read)
-    faults |= {
-        t.index: f"{t.source} has one frame: a curve needs at least 2"
-        for t in found
-        if t.length < 2
-    }
-    broken = [Skipped(t.name, faults[t.index]) for t in found if t.index in faults]
-    sound = [t for t in found if t.index not in faults]
-    if not sound:
-        raise UserError(broken[0].reason)
-    shortest = min(sound, key=lambda t: t.length)
-    inputs = Inputs(
-        name=shortest.source,
-        camera=camera if camera in episodes.features else None,
-        sides=touch,
-        sensor=next(iter(sensors), None),
-        scene=scene_of(episodes.features),
-        length=shortest.length,
-        cameras=cameras,
-        task=next(iter(tasks)) if len(tasks) == 1 else "",
-    )
-    return Source(inputs, sound, broken)
-
-
-def _trajectories(
-    episodes: EpisodeSet, chosen: Sequence[int], keys: tuple[str, ...]
-) -> list[EpisodeTrajectory]:
-    lengths = episodes.lengths
-    offsets = [0, *accumulate(lengths)]
-    return [
+    wanted = dict.fromkeys((*CAMERAS, camera, *touch, TRUTH_CONTACT, *ARM.values()))
+    read = tuple(key for key in wanted if key in episodes.features)
+    offsets, lengths = [0, *accumulate(episodes.lengths)], episodes.lengths
+    found = [
         EpisodeTrajectory(
             name=f"episode_{i:03d}",
             source=f"{episodes.root.name}#{i}",
@@ -113,21 +80,36 @@ def _trajectories(
             fps=episodes.fps,
             meta=episodes.meta(i),
             episodes=episodes,
-            keys=keys,
+            keys=read,
         )
         for i in chosen
     ]
-
-
-def _check_index(episodes: EpisodeSet, index: Sequence[int]) -> None:
-    root = episodes.root
-    for i in index:
-        if not 0 <= i < len(episodes):
-            raise UserError(f"{root} has no episode {i}; it has 0 to {len(episodes) - 1}")
-        if index.count(i) > 1:
-            raise UserError(f"--index names episode {i} {index.count(i)} times: name it once")
-    if not len(episodes):
-        raise UserError(f"{root} has no episodes")
+    sensors = {str(t.meta["sensor"]) for t in found if t.meta.get("sensor")}
+    if len(sensors) > 1:
+        raise UserError(f"{root} mixes the sensors {', '.join(sorted(sensors))}: choose --index")
+    tasks = {episodes.task(i) for i in chosen}
+    if touch:
+        seen = {chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)}
+        if readable := [i for i in sorted(seen) if _reads(episodes, i, touch)]:
+            check_fingertips(episodes, readable)
+    short = {t.index: t.source for t in found if t.length < 2}
+    faults = find_faults(episodes, chosen, read)
+    faults |= {i: f"{name} has one frame: a curve needs at least 2" for i, name in short.items()}
+    broken = [Skipped(t.name, faults[t.index]) for t in found if t.index in faults]
+    sound = [t for t in found if t.index not in faults]
+    if not sound:
+        raise UserError(broken[0].reason)
+    shortest = min(sound, key=lambda t: t.length)
+    inputs = Inputs.of(
+        shortest.source,
+        read,
+        camera,
+        sensor=next(iter(sensors), None),
+        scene=scene_of(episodes.features),
+        length=shortest.length,
+        task=next(iter(tasks)) if len(tasks) == 1 else "",
+    )
+    return Source(inputs, sound, broken)
 
 
 def _find_camera(episodes: EpisodeSet, camera: str, touch: bool) -> str:
@@ -153,9 +135,8 @@ def _reads(episodes: EpisodeSet, i: int, keys: Sequence[str]) -> bool:
 def default_goals(trajectories: Sequence[Trajectory]) -> dict[str, GoalSpec]:
     """Return the goal of each trajectory by name, where the user gave none.
 
-    That is its own last frame. With it every failure would end at a cost of 0, so if a
-    trajectory failed, it is the nearest end of the set's other
-    successes with the same object; a success that is the only one with its object keeps its own end.
+    That is its own last frame. With it every failure would end at a cost of 0, so if a trajectory
+    failed, it is the nearest end of the set's other successes with the same object; a success that is the only one with its object keeps its own end.
     UserError: a failure among videos, or an object without a success.
     """
     failed = [t for t in trajectories if t.meta.get("success") is False]
@@ -167,28 +148,19 @@ def default_goals(trajectories: Sequence[Trajectory]) -> dict[str, GoalSpec]:
             f"{failed[0].name} failed, and at its own last frame a failure costs 0, too: give the "
             "end of a success, --goal image:FILE or --goal episode:SET#K"
         )
-    successes = _successes(episodes[0].episodes)
-    return {t.name: _successful_ends(t, successes) for t in episodes}
-
-
-def _successes(episodes: EpisodeSet) -> dict[str, list[int]]:
-    """Return the successful episodes of each object."""
-    found: dict[str, list[int]] = {}
-    for i in range(len(episodes)):
-        meta = episodes.meta(i)
-        if meta.get("success"):
-            found.setdefault(str(meta.get("object", "")), []).append(i)
-    return found
-
-
-def _successful_ends(trajectory: EpisodeTrajectory, successes: Mapping[str, list[int]]) -> GoalSpec:
-    root, what = trajectory.episodes.root, str(trajectory.meta.get("object", ""))
-    same_object = successes.get(what, [])
-    if set(same_object) - {trajectory.index}:
-        return Bank(root, trajectory.episodes.keys)
-    if same_object:
-        return OwnFrame()
-    raise UserError(
-        f"failures are among the episodes, and no success of {root} has the object of "
-        f"{trajectory.source} ({what or 'unknown'}): give a goal, --goal episode:SET#K"
-    )
+    of, root = episodes[0].episodes, episodes[0].episodes.root
+    successes: dict[str, list[int]] = {}  # of each object
+    for i in range(len(of)):
+        if (meta := of.meta(i)).get("success"):
+            successes.setdefault(str(meta.get("object", "")), []).append(i)
+    goals: dict[str, GoalSpec] = {}
+    for t in episodes:
+        what = str(t.meta.get("object", ""))
+        if what not in successes:
+            raise UserError(
+                f"failures are among the episodes, and no success of {root} has the object of "
+                f"{t.source} ({what or 'unknown'}): give a goal, --goal episode:SET#K"
+            )
+        alone = successes[what] == [t.index]
+        goals[t.name] = OwnFrame() if alone else Bank(root, of.keys)
+    return goals

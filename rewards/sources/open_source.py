@@ -88,17 +88,18 @@ def open_successes(
         if not sets:
             raise UserError(f"{skipped.name} is broken: {skipped.reason}")
         print(f"left out: {skipped.reason}", file=sys.stderr)
-    success = {t: t.meta.get("success") for source in sources for t in source.trajectories}
-    if sets and None in success.values() and not assume_success:
-        unknown = list(success.values()).count(None)
+    found = [t for source in sources for t in source.trajectories]
+    unknown = sum(t.meta.get("success") is None for t in found)
+    if sets and unknown and not assume_success:
         raise UserError(
-            f"{unknown} of {len(success)} episodes of {sets[0]} have no recorded outcome: give "
+            f"{unknown} of {len(found)} episodes of {sets[0]} have no recorded outcome: give "
             "--assume-success if they succeeded"
         )
+    episodes = [t for t in found if isinstance(t, EpisodeTrajectory)]
+    failed = [t for t in episodes if t.meta.get("success") is False]
     if sets:
-        chosen = [t for t, reached in success.items() if reached is not False]
+        chosen = [t for t in episodes if t not in failed]
         sources = [replace(sources[0], trajectories=chosen)]
-    if sum(len(source.trajectories) for source in sources) < 2:
+    if len(found) - len(failed) < 2:
         raise UserError("a normalizer needs at least two successful episodes or videos")
-    failed = [t for t, reached in success.items() if reached is False]
-    return sources, [t for t in failed if isinstance(t, EpisodeTrajectory)]
+    return sources, failed

@@ -61,21 +61,6 @@ def frames_per_chunk(frame_bytes: int) -> int:
     return max(int(_CHUNK_BYTES / max(frame_bytes, 1)), _FEWEST_FRAMES)
 
 
-class _ReadAhead(Iterator[Episode]):
-    """Chunks of a trajectory, of which the next one is read by a thread in the meantime."""
-
-    def __init__(self, chunks: Iterator[Episode], pool: ThreadPoolExecutor) -> None:
-        self._chunks, self._pool = chunks, pool
-        self._next: Future[Episode | None] = pool.submit(next, chunks, None)
-
-    def __next__(self) -> Episode:
-        chunk = self._next.result()
-        if chunk is None:
-            raise StopIteration
-        self._next = self._pool.submit(next, self._chunks, None)
-        return chunk
-
-
 def read_ahead(trajectories: Iterable[Trajectory]) -> Iterator[Iterator[Episode]]:
     """Yield the chunks of each trajectory, while threads read the next ones.
 
@@ -84,8 +69,17 @@ def read_ahead(trajectories: Iterable[Trajectory]) -> Iterator[Iterator[Episode]
     with ThreadPoolExecutor(_THREADS) as pool:
         waiting: deque[Iterator[Episode]] = deque()
         for trajectory in trajectories:
-            waiting.append(_ReadAhead(trajectory.chunks(), pool))
+            chunks = trajectory.chunks()
+            waiting.append(_read_on(pool.submit(next, chunks, None), chunks, pool))
             if len(waiting) > _THREADS:
                 yield waiting.popleft()
         while waiting:
             yield waiting.popleft()
+
+
+def _read_on(
+    following: Future[Episode | None], chunks: Iterator[Episode], pool: ThreadPoolExecutor
+) -> Iterator[Episode]:
+    while (chunk := following.result()) is not None:
+        following = pool.submit(next, chunks, None)
+        yield chunk

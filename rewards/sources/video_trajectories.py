@@ -44,12 +44,13 @@ class VideoTrajectory(Trajectory):
 
     def checksum(self) -> str:
         """Return sizes and times of the files, and a hash of the untouched frames given apart."""
-        paths = [p for clip in self.clips.values() for p in _files(clip.path)]
-        stats = [path.stat() for path in paths]
+        given = (clip.path for clip in self.clips.values())
+        files = [f for p in given for f in (in_natural_order(p.iterdir()) if p.is_dir() else [p])]
+        stats = [f"{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files]
         hashes = [
             hashlib.sha256(frames.tobytes()).hexdigest() for frames in self.untouched.values()
         ]
-        return " ".join([*(f"{s.st_size}:{s.st_mtime_ns}" for s in stats), *hashes])
+        return " ".join([*stats, *hashes])
 
     def chunks(self) -> Iterator[Episode]:
         """See Trajectory."""
@@ -103,23 +104,19 @@ def open_videos(
         offset += first.length
     if not opened:
         raise UserError(skipped[0].reason)
-    keys = list(opened[0].clips)
-    for trajectory in opened[1:]:
-        if set(trajectory.clips) != set(keys):
-            raise UserError(
-                f"{trajectory.name} shows {_words(trajectory.clips)}, but {opened[0].name} "
-                f"{_words(keys)}: measure them apart, or give each the same videos"
-            )
+    keys = opened[0].clips.keys()
+    if other := next((t for t in opened if t.clips.keys() != keys), None):
+        raise UserError(
+            f"{other.name} shows {_words(other.clips)}, but {opened[0].name} "
+            f"{_words(keys)}: measure them apart, or give each the same videos"
+        )
     shortest = min(opened, key=lambda trajectory: trajectory.length)
-    inputs = Inputs(
-        name=shortest.source,
-        camera=camera if camera in keys else None,
-        sides=tuple(key for key in ft.TACTILE if key in keys),
-        scene="a plain video",
-        length=shortest.length,
-        cameras=tuple(key for key in ft.CAMERAS if key in keys),
-    )
-    return Source(inputs, opened, skipped, _summary(path, opened))
+    length = shortest.length
+    inputs = Inputs.of(shortest.source, keys, camera, scene="a plain video", length=length)
+    about = f"{length} frames at {shortest.fps:g} per second"
+    if len(opened) > 1:
+        about = f"{len(opened):,} trajectories, {offset:,} frames"
+    return Source(inputs, opened, skipped, f"{path.name}: {about}, {_words(keys)}")
 
 
 def _find(path: Path, camera: str) -> dict[str, dict[str, Path]]:
@@ -127,42 +124,28 @@ def _find(path: Path, camera: str) -> dict[str, dict[str, Path]]:
     if path.is_file():
         name = _split_name(path)[0] or path.parent.name
         return {name: _group(path.parent, camera).get(name, {camera: path})}
-    entries = in_natural_order(path.iterdir())
-    if any(e.suffix.lower() in IMAGES for e in entries) or _named_by_role(path):
-        return {path.resolve().name: _files_of(path, camera)}
     found = _group(path, camera)
-    for folder in entries:
-        if folder.is_dir() and (files := _files_of(folder, camera)):
-            found[folder.name] = files
+    if "" in found:
+        return {path.resolve().name: found[""]}
+    for folder in filter(Path.is_dir, in_natural_order(path.iterdir())):
+        groups = _group(folder, camera)
+        if "" in groups or len(groups) == 1:
+            found[folder.name] = groups.get("") or next(iter(groups.values()))
     if not found:
         open_clip(path)  # says what is missing
     return found
 
 
-def _files_of(folder: Path, camera: str) -> dict[str, Path]:
-    """Return the files of one trajectory's folder by what they show; {} if it is none."""
-    if files := _named_by_role(folder):
-        return files
-    if any(entry.suffix.lower() in IMAGES for entry in folder.iterdir()):
-        return {camera: folder}
-    groups = list(_group(folder, camera).values())
-    return groups[0] if len(groups) == 1 else {}
-
-
-def _named_by_role(folder: Path) -> dict[str, Path]:
-    """Return the videos and folders of images that are named by what they show alone: front.mp4."""
-    return {
-        _ROLES[entry.stem]: entry
-        for entry in in_natural_order(folder.iterdir())
-        if entry.stem in _ROLES and (entry.is_dir() or entry.suffix.lower() in VIDEOS)
-    }
-
-
 def _group(folder: Path, camera: str) -> dict[str, dict[str, Path]]:
-    """Return the videos of a folder by the name that they share, and by what they show."""
-    groups: dict[str, dict[str, Path]] = {}
+    """Return the videos of a folder by the name that they share, and by what they show.
+
+    That name is "" for what is named by what it shows alone (front.mp4, or a folder of images), and for
+    a folder of images itself.
+    """
+    groups, images = dict[str, dict[str, Path]](), False
     for path in in_natural_order(folder.iterdir()):
-        if path.suffix.lower() not in VIDEOS or path.is_dir():
+        images |= path.suffix.lower() in IMAGES
+        if path.suffix.lower() not in VIDEOS if path.is_file() else path.stem not in _ROLES:
             continue
         name, role = _split_name(path)
         shows = groups.setdefault(name, {})
@@ -170,6 +153,8 @@ def _group(folder: Path, camera: str) -> dict[str, dict[str, Path]]:
         if key in shows:
             raise UserError(f"{path} and {shows[key]} both show {_words([key])}: rename one")
         shows[key] = path
+    if images:
+        groups.setdefault("", {camera: folder})
     return groups
 
 
@@ -221,26 +206,15 @@ def _read_labels(folder: Path) -> dict[str, dict[str, MetaValue]]:
         rows = list(csv.DictReader(file))
     if rows and not {"file", "outcome"} <= rows[0].keys():
         raise UserError(f"{path} needs the columns file and outcome")
-    return {_split_name(Path(row["file"]))[0]: _facts(row) for row in rows}
-
-
-def _facts(row: Mapping[str, str]) -> dict[str, MetaValue]:
-    facts: dict[str, MetaValue] = {key: row[key] for key in _FACTS if row.get(key)}
-    return facts | ({"success": row["outcome"] == "success"} if row["outcome"] else {})
-
-
-def _files(path: Path) -> list[Path]:
-    return in_natural_order(path.iterdir()) if path.is_dir() else [path]
+    labels: dict[str, dict[str, MetaValue]] = {}
+    for row in rows:
+        facts = labels[_split_name(Path(row["file"]))[0]] = {
+            k: row[k] for k in _FACTS if row.get(k)
+        }
+        if row["outcome"]:
+            facts["success"] = row["outcome"] == "success"
+    return labels
 
 
 def _words(keys: Iterable[str]) -> str:
     return ", ".join(key.removeprefix(ft.IMAGE_PREFIX) for key in sorted(keys))
-
-
-def _summary(path: Path, opened: Sequence[VideoTrajectory]) -> str:
-    """Return number, length and rate, for people."""
-    first = opened[0]
-    what = f"{first.length} frames at {first.fps:g} per second"
-    if len(opened) > 1:
-        what = f"{len(opened):,} trajectories, {sum(t.length for t in opened):,} frames"
-    return f"{path.name}: {what}, {_words(first.clips)}"
