@@ -43,7 +43,7 @@ BENCHMARKS = {
     ),
     "reward-use": (
         "papers.reward_use",
-        "demonstrations weighted, checkpoints ranked by the reward",
+        "learning from the demonstrations that a reward accepts",
     ),
     "improve": ("papers.improve", "a policy improved by its own runs, by what accepts them"),
     "grasp-search": ("papers.grasp_search", "grasps found by trial on the cost"),

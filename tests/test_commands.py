@@ -242,12 +242,12 @@ def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_benchmark_reward_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reward_use, "_TASK", PickPlaceConfig(objects=("brick",), max_seconds=1))
     sizes = "--training 4 --goals 1 --demonstrations 4 --validation 1 --seeds 1 --trials 1"
-    words = f"reward-use {sizes} --checkpoints 1 --rollouts 1 --train.epochs 1"
-    rows = ("--weights", "none", "fused")
+    words = f"reward-use {sizes} --train.epochs 1"
+    rows = ("--weights", "none", "accepted by judge")
     run_benchmark(*words.split(), *rows, "--env.camera-size", 64, 64, "--out", tmp_path)
     used = json.loads((tmp_path / "metrics.json").read_text())
-    assert used["imitation"]["none"][0]["used"] == 1 > used["imitation"]["fused"][0]["used"]
-    assert len(used["checkpoints"]) == 1
+    accepted = used["imitation"]["accepted by judge"][0]
+    assert used["imitation"]["none"][0]["used"] == 1 > accepted["used"]
 
 
 @pytest.mark.slow

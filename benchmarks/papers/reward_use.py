@@ -1,4 +1,4 @@
-"""Imitation weighted by the reward, and checkpoints ranked by it.
+"""Imitation of the demonstrations that a reward accepts.
 
 Demonstrations are of mixed quality. Policies are regressions like the shipped pick-and-place policy.
 """
@@ -8,12 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float, Float32
-from pydantic import Field
-from scipy.stats import spearmanr
 
 from benchmarks.options import CORES, BenchmarkOptions
 from benchmarks.papers.mixed_demonstrations import record_mixed, record_right
@@ -22,12 +19,10 @@ from benchmarks.papers.reward_quality.embedding import EmbeddedFiles
 from benchmarks.papers.reward_quality.judging import Judge, fit_judge
 from benchmarks.papers.reward_quality.recording import Recorded, Sizes, plan, record
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.episodes.recording import collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import (
     ESTIMATOR,
-    POLICY_FORMAT,
     SHIPPED_POLICIES,
     SavedPolicy,
 )
@@ -35,15 +30,13 @@ from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.evaluation.evaluate import Trial, run_trials, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.network import PolicyConfig
-from touchgoal.policies.training.improve import Acting
 from touchgoal.policies.training.model_selection import copy_parts
 from touchgoal.policies.training.sequence_dataset import (
     Recordings,
     SequenceDataset,
     load_recordings,
 )
-from touchgoal.policies.training.train import POLICY, SNAPSHOTS, train
-from touchgoal.rewards.curves import FUSED
+from touchgoal.policies.training.train import POLICY, train
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.runtime.parallel.parallel_map import parallel_map
@@ -52,23 +45,17 @@ from touchgoal.sim_envs.config import PickPlaceConfig
 
 _ESTIMATOR = SHIPPED_POLICIES["pick-place"] / ESTIMATOR
 _TASK = PickPlaceConfig(objects=HELD_OUT_OBJECTS)
-ACCEPTED = "accepted by "
+_ACCEPTED = "accepted by "
 _KEPT = 0.8  # share of right ones that a limit accepts
-_IN_FULL = 0.01  # progress above which a frame counts in full: kappa of RA-BC
-_EPOCHS_APART = 2  # between two checkpoints that are ranked
 Weights = Literal[
     "none",
     "successes alone",
-    "fused",
-    "image",
-    "tactile",
     "accepted by judge",
     "accepted by image",
     "accepted by tactile",
 ]
-"""Weights of the demonstrations: none; 1 for successes, 0 for others; those of `_progress_weights` by a
-cost (RA-BC); 1 where the end is no dearer than
-four of five right ones, else 0."""
+"""Weights of the demonstrations: none; 1 for successes, else 0; 1 where the end is no dearer than four of five
+right ones, else 0."""
 
 
 @checked_dataclass
@@ -95,12 +82,6 @@ class Config(BenchmarkOptions):
     """Trainings of each row, each with another seed."""
     trials: Count = 24
     """Simulated episodes of each policy."""
-    checkpoints: Annotated[int, Field(ge=0)] = 8
-    """Checkpoints to rank, one every second epoch, of a training on the successes; 0: none."""
-    rollouts: Count = 12
-    """Episodes of each checkpoint that the reward judges."""
-    seconds: Count = 1
-    """Time in which a demonstration's progress is measured, s."""
     train: TrainConfig = field(default_factory=lambda: TrainConfig(epochs=16, lr=1e-3))
     """Training of the policies."""
     env: PickPlaceConfig = PickPlaceConfig()
@@ -139,12 +120,9 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
     judge.files.make([*mixed, *right], config.workers)
     demonstrations = _read(mixed, right)
     rows = _imitate(demonstrations, judge, config)
-    ranked = _checkpoints(demonstrations, judge, config) if config.checkpoints else []
     sizes = f"{len(mixed)} demonstrations, {sum(_good(mixed))} of them successes"
-    text = _imitation_table(rows, sizes, config.trials)
-    if ranked:
-        text += "\n\n" + _checkpoint_table(ranked)
-    return {"table": text, "trials": config.trials, "imitation": rows, "checkpoints": ranked}
+    table = _imitation_table(rows, sizes, config.trials)
+    return {"table": table, "trials": config.trials, "imitation": rows}
 
 
 def _fitted(config: Config, folder: Path) -> Judge:
@@ -172,35 +150,14 @@ def _good(recorded: Sequence[Recorded]) -> list[bool]:
     return [r.outcome == "success" for r in recorded]
 
 
-def _weights(name: str, data: _Demonstrations, judge: Judge, config: Config) -> np.ndarray | None:
+def _weights(name: str, data: _Demonstrations, judge: Judge) -> np.ndarray | None:
     lengths = data.recordings.lengths
     if name == "none":
         return None
     if name == "successes alone":
         return np.repeat(_good(data.recorded), lengths).astype(np.float32)
-    if name.startswith(ACCEPTED):
-        accepted = _accepted(judge, data, name.removeprefix(ACCEPTED))
-        return np.repeat(accepted, lengths).astype(np.float32)
-    progress = [_progress(judge, r, name, n) for r, n in zip(data.recorded, lengths, strict=True)]
-    return _progress_weights(progress, config.seconds * data.policy.control_hz)
-
-
-def _progress_weights(
-    progress: Sequence[Float[np.ndarray, " _"]], ahead: int
-) -> Float32[np.ndarray, " n"]:
-    """Return a weight in [0, 1] for every frame, by the progress of its episode in the next `ahead`.
-
-    Reward-aligned behaviour cloning (RA-BC) of SARM (Chen et al. 2025, arXiv:2509.25358, eq. 8 and
-    9), as lerobot computes it: frames with progress count in full, those that lose it not at all.
-    """
-    later = [np.minimum(np.arange(len(p)) + ahead, len(p) - 1) for p in progress]
-    gain = np.concatenate([p[to] - p for p, to in zip(progress, later, strict=True)])
-    mean, spread = max(gain.mean(), 0.0), max(gain.std(), 1e-6)
-    weights = np.clip((gain - mean + 2 * spread) / (4 * spread), 0, 1)
-    weights[gain > _IN_FULL] = 1
-    weights[gain < 0] = 0
-    weights[np.cumsum([len(p) for p in progress]) - 1] = 0  # no action follows the last frame
-    return weights.astype(np.float32)
+    accepted = _accepted(judge, data, name.removeprefix(_ACCEPTED))
+    return np.repeat(accepted, lengths).astype(np.float32)
 
 
 def _accepted(judge: Judge, data: _Demonstrations, curve: str) -> list[bool]:
@@ -214,13 +171,6 @@ def _accepted(judge: Judge, data: _Demonstrations, curve: str) -> list[bool]:
     right = [r for r, good in zip(data.right, _good(data.right), strict=True) if good]
     limit = np.quantile([last(r) for r in right], _KEPT)
     return [last(r) <= limit for r in data.recorded]
-
-
-def _progress(judge: Judge, r: Recorded, curve: str, length: int) -> Float[np.ndarray, " n"]:
-    """Return the progress at every frame, between the measured ones by a straight line."""
-    cost = judge.costs(judge.files.load(r), r.object)[curve]
-    measured = np.arange((length - 1) % judge.files.every, length, judge.files.every)
-    return np.clip(1 - np.interp(np.arange(length), measured, cost), 0, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +199,7 @@ def _imitate(
     data: _Demonstrations, judge: Judge, config: Config
 ) -> dict[str, list[dict[str, float]]]:
     """Return what came of every seed, row by row."""
-    weights = {name: _weights(name, data, judge, config) for name in config.weights}
+    weights = {name: _weights(name, data, judge) for name in config.weights}
     jobs = list(product(config.weights, range(config.seeds)))
     with parallel_map(_Imitation(data, weights, config), jobs, config.workers) as results:
         found = list(track(results, "imitation", "training", total=len(jobs)))
@@ -273,51 +223,6 @@ def _try(policy: Path, trials: int, workers: int) -> list[Trial]:
     return list(run_trials(env, maker, specs, workers))
 
 
-def _checkpoints(data: _Demonstrations, judge: Judge, config: Config) -> list[dict[str, float]]:
-    """Return success, mean last cost of each curve, and validation error of every checkpoint."""
-    windows = data.windows(_weights("successes alone", data, judge, config))
-    epochs = _EPOCHS_APART * config.checkpoints
-    several = replace(config.train, epochs=epochs, snapshot_epochs=_EPOCHS_APART)
-    found = []
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        _train(data, windows, several, folder, 0)
-        for snapshot in track(sorted((folder / SNAPSHOTS).iterdir()), "checkpoints", "checkpoint"):
-            trials = _try(snapshot, config.trials, config.workers)
-            costs = _judge_rollouts(snapshot, judge, config, folder / f"rollouts-{snapshot.name}")
-            known = POLICY_FORMAT.provenance(snapshot)["metrics"]
-            found.append(
-                {
-                    "success": sum(t.success for t in trials) / len(trials),
-                    "progress": float(np.mean([t.progress for t in trials])),
-                    "validation_error": known["validation_error"],
-                }
-                | costs
-            )
-    return found
-
-
-def _judge_rollouts(policy: Path, judge: Judge, config: Config, folder: Path) -> dict[str, float]:
-    """Record episodes in which a checkpoint acts; return their mean last costs."""
-    size = SavedPolicy(policy)().env_config(_TASK).camera_size
-    env = replace(_TASK, cameras=("front", "wrist"), camera_size=size)
-    specs = trial_specs(env, config.rollouts, seeds.POLICY_TEST.start + config.trials)
-    collect(folder, env, specs, config.workers, Acting(SavedPolicy(policy)))
-    episodes, files = EpisodeSet(folder), replace(judge.files, folder=folder / "embedded")
-    recorded = [
-        Recorded(folder, i, "test", "", str(episodes.meta(i)["object"]), "elsewhere")
-        for i in range(len(episodes))
-    ]
-    files.make(recorded, config.workers)
-    last = [
-        {k: float(c[-1]) for k, c in judge.costs(files.load(r), r.object).items()} for r in recorded
-    ]
-    return {
-        f"cost, {k}": float(np.mean([costs[k] for costs in last]))
-        for k in (FUSED, "image", "tactile")
-    }
-
-
 def _imitation_table(rows: dict[str, list[dict[str, float]]], sizes: str, trials: int) -> str:
     head = f"{'imitation weighted by':<24}{'windows used':>14}{'success [95 % Wilson]':>26}  of each seed"
     lines = [sizes, head]
@@ -325,15 +230,4 @@ def _imitation_table(rows: dict[str, list[dict[str, float]]], sizes: str, trials
         won = [int(f["successes"]) for f in found]
         rate = SuccessRate(sum(won), trials * len(won))
         lines.append(f"{name:<24}{found[0]['used']:>14.0%}{rate!s:>26}  {' '.join(map(str, won))}")
-    return "\n".join(lines)
-
-
-def _checkpoint_table(ranked: list[dict[str, float]]) -> str:
-    names = list(ranked[0])
-    lines = ["checkpoint" + "".join(f"{n:>18}" for n in names)]
-    for i, row in enumerate(ranked, 1):
-        lines.append(f"epoch {_EPOCHS_APART * i:<4}" + "".join(f"{row[n]:>18.3f}" for n in names))
-    success = [row["success"] for row in ranked]
-    of = [spearmanr(success, [row[n] for row in ranked])[0] for n in names]
-    lines.append("rank corr." + "".join(f"{r:>18.2f}" for r in of))
     return "\n".join(lines)

@@ -92,7 +92,7 @@ def open_successes(
     unknown = sum(t.meta.get("success") is None for t in found)
     if sets and unknown and not assume_success:
         raise UserError(
-            f"{unknown} of {len(found)} episodes of {sets[0]} have no recorded outcome: give "
+            f"{unknown} of {len(found)} episodes of {' '.join(map(str, paths))} have no recorded outcome: give "
             "--assume-success if they succeeded"
         )
     episodes = [t for t in found if isinstance(t, EpisodeTrajectory)]
