@@ -269,13 +269,12 @@ class Rising(CostMeter):
     judges = False
 
     def __init__(self) -> None:
-        self.waiting, self.costs, self.may_go_on = deque(), [0.1, 0.9], threading.Event()
+        self.waiting, self.costs, self.may_go_on = deque(maxlen=1), [0.1, 0.9], threading.Event()
 
     def measure(self) -> CostReading | None:
         if not self.waiting:
             return None
         stamp = self.waiting.pop()[0]
-        self.waiting.clear()
         cost = self.costs.pop(0) if self.costs else self.may_go_on.wait() * 0.9
         return CostReading(cost, stamp)
 
