@@ -57,7 +57,7 @@ class CurveMetrics:
         return asdict(self)
 
 
-def measure_curve(d: Curve, contact: int | None) -> CurveMetrics:
+def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> CurveMetrics:
     """Measure one curve.
 
     ValueError: fewer than 2 frames, a value that is not finite, a contact outside the curve.
@@ -65,6 +65,8 @@ def measure_curve(d: Curve, contact: int | None) -> CurveMetrics:
     Args:
         d: distance to the goal per frame, at least 2 frames, finite.
         contact: first frame in contact; None without contact.
+        eps: noise threshold (curve). Default: 3 sigma of this curve. Give the same eps to several
+            curves to compare their peaks on equal terms.
     """
     if len(d) < 2:
         raise ValueError(f"a curve needs at least 2 frames, this one has {len(d)}")
@@ -74,7 +76,7 @@ def measure_curve(d: Curve, contact: int | None) -> CurveMetrics:
         raise ValueError(f"contact frame {contact} lies outside the curve's {len(d)} frames")
     d = d.astype(np.float64)
     sigma = noise(d, contact)
-    eps = max(3 * sigma, EPS_FLOOR)
+    eps = max(3 * sigma, EPS_FLOOR) if eps is None else eps
     time = np.arange(len(d))
     ordered = float(np.ptp(d)) > EPS_FLOOR
     start, end = float(np.median(d[:START_FRAMES])), float(d[-1])

@@ -22,7 +22,7 @@ def seen(joints: float, width: float) -> Observation:
 
 
 def test_it_goes_back_at_a_bounded_speed_and_gives_up_after_two_more_tries() -> None:
-    regrasp, first = Regrasp(HZ), seen(0.0, 0.04)
+    regrasp, first, way = Regrasp(HZ), seen(0.0, 0.04), np.ones((1, 8))
     for miss in range(3):
         said = [regrasp.next(seen(0.3, 0.001), first, 0.0, TICKS) for _ in range(3)]
         assert said == ["act", "act", "back"], "a glance at shut fingers is not enough"

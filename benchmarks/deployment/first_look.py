@@ -27,7 +27,6 @@ from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import (
     USUAL_CAMERA,
-    CameraPlacement,
     PickPlaceConfig,
     SceneConfig,
 )
@@ -74,13 +73,12 @@ def _camera(
     """Return the option of a camera shifted (m) and turned (roll, pitch, yaw, degrees) from the usual one."""
     usual = Rotation.from_quat(USUAL_CAMERA[3:7], scalar_first=True)
     quat = (usual * Rotation.from_euler("zxy", turn, degrees=True)).as_quat(scalar_first=True)
-    placement: CameraPlacement = (*np.add(USUAL_CAMERA[:3], shift), *quat, fovy)
-    return {"front_camera": placement}
+    return {"front_camera": (*np.add(USUAL_CAMERA[:3], shift), *quat, fovy)}
 
 
 def _painted(name: str, *rgb: float) -> Callable[[Spec], None]:
     def change(spec: Spec) -> None:
-        spec.geom(name).rgba = [*rgb, 1]
+        spec.geom(name).rgba[:] = *rgb, 1
 
     return change
 
@@ -94,14 +92,14 @@ def _patterned(kind: mujoco.mjtBuiltin, first: list[float], second: list[float])
         material = spec.add_material(name="cloth", texrepeat=[8, 8])
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "cloth"
         spec.geom("table").material = "cloth"
-        spec.geom("table").rgba = [1, 1, 1, 1]
+        spec.geom("table").rgba[:] = 1
 
     return change
 
 
 def _sized(radius: float) -> Callable[[Spec], None]:
     def change(spec: Spec) -> None:
-        spec.geom("goal").size = [radius, 0.0005, 0]
+        spec.geom("goal").size[:] = radius, 0.0005, 0
 
     return change
 
@@ -112,7 +110,8 @@ def _noisy(image: np.ndarray) -> np.ndarray:
 
 
 def _compressed(image: np.ndarray) -> np.ndarray:
-    return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 40])[1], -1)
+    _, packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 40])
+    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_UNCHANGED))
 
 
 def _half_covered(image: np.ndarray) -> np.ndarray:

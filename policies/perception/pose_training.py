@@ -230,10 +230,10 @@ def _look(
     for some, chosen in zip(rows.split(_BATCH), words.split(_BATCH), strict=True):
         lit = evenly_lit({key: images[some] for key, images in placements.images.items()})
         looks.append(estimator.look(lit, chosen, estimator.scene(lit, placements.tcp[some])))
-    joined = (torch.cat([getattr(o, k) for o in looks]) for k in ("start", "found", "turned"))
-    second = torch.cat([o.second for o in looks])
+    names = ("start", "found", "turned", "second")
+    joined = {name: torch.cat([getattr(o, name) for o in looks]) for name in names}
     places = {key: torch.cat([o.places[key] for o in looks]) for key in looks[0].places}
-    return Look(*joined, places, second)
+    return Look(places=places, **joined)
 
 
 def _yaw_error(predicted: Float[Tensor, "n 7"], true: Float[Tensor, "n 7"]) -> Float[Tensor, " n"]:

@@ -1,7 +1,5 @@
 """Contact of each fingertip frame by frame: whether it touches, how hard, where, and slip."""
 
-from functools import partial
-
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -37,8 +35,11 @@ class ContactReader:
                 self._depth = DepthEstimator(calibration, _CELL)
             self._pitch = calibration.pixel_pitch
             size = calibration.background.shape[1::-1]
-        self._resized = partial(cv2.resize, dsize=size, interpolation=cv2.INTER_AREA)
+        self._size = size
         self._detector = contact_detector(np.stack([self._resized(f) for f in untouched]))
+
+    def _resized(self, frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "y x 3"]:
+        return np.asarray(cv2.resize(frame, self._size, interpolation=cv2.INTER_AREA))
 
     def read(self, frames: UInt8[np.ndarray, "n h w 3"]) -> dict[str, np.ndarray]:
         """Return by part (`features.embedded`) the readings of the next frames, (n,) or (n, 2).

@@ -15,7 +15,6 @@
 Without parts there are image and touch alone. Force, centre and slip need a sensor with a file.
 """
 
-import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -71,7 +70,7 @@ class EmbeddedEpisode:
     def modalities(self) -> tuple[Modality, ...]:
         """Modalities that a normalizer can be fitted to."""
         there = (IMAGE in self.features, TOUCH in self.features, len(self.descriptions) > 0)
-        return tuple(itertools.compress(MODALITIES, there))
+        return tuple(name for name, known in zip(MODALITIES, there, strict=False) if known)
 
     def with_facts(self, meta: Mapping[str, MetaValue]) -> "EmbeddedEpisode":
         """Return the trajectory with the object and the outcome that its meta name."""
