@@ -1,5 +1,6 @@
 """Encoders and policies by way of a model hub: huggingface_hub's own client, over the wire."""
 
+import io
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hub_server import TOKEN, HubServer
 from huggingface_hub import HfApi, constants
@@ -113,11 +115,14 @@ def test_refusals_in_a_line(
 def test_others_files_are_refused_and_no_code_is_fetched(hub: HubServer, tmp_path: Path) -> None:
     push(ENCODER, "lab/model", False, api(hub))
     sound = dict(hub.repositories["lab/model"])
+    np.savez(pickled := io.BytesIO(), about=np.array([{}], object))
     other = json.dumps(json.loads(sound["config.json"]) | {"model_type": "bert"}).encode()
     for changes, message in (
         ({"config.json": other}, "holds no encoder or policy that touchgoal push made"),
         ({"config.json": b"{"}, "lab/model: config.json is damaged or no json"),
         ({"model.safetensors": b"\x80\x04pickle"}, "is damaged or no safetensors"),
+        ({"goal.npz": pickled.getvalue()}, "goal.npz is damaged or no npz"),
+        ({"goal.npz": b"PK"}, "goal.npz is damaged or no npz"),
         ({"model.safetensors": sound["value.safetensors"]}, "does not fit its encoder.json"),
     ):
         hub.repositories["lab/model"] = sound | changes

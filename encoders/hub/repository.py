@@ -12,7 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, get_args
+from zipfile import BadZipFile
 
+import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from touchgoal.runtime.errors import UserError
@@ -24,7 +26,7 @@ Kind = Literal["encoder", "policy"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 _MODEL_TYPE = "model_type"  # the Hub's key in config.json
-_DATA_FILE = re.compile(r"(\w[\w-]*/){0,2}\w[\w-]*\.(json|safetensors)")
+_DATA_FILE = re.compile(r"(\w[\w-]*/){0,2}\w[\w-]*\.(json|safetensors|npz)")
 """Paths that are pushed and pulled, beside the card: at most two folders deep."""
 _LOG_IN = "log in with: hf auth login (or set HF_TOKEN)"
 
@@ -78,7 +80,7 @@ def push(folder: Path, repository: str, private: bool, api: "HfApi") -> str:
 def pulled(repository: str, beside: Path, api: "HfApi") -> Iterator[tuple[Path, Kind]]:
     """Download an encoder or a policy; yield its temporary folder, in `beside`, and its kind.
 
-    Only JSON, safetensors and the card are downloaded, and each file is opened to check it. To
+    Only JSON, safetensors, npz and the card are downloaded, and each file is opened to check it. To
     keep the folder, the caller moves it.
 
     UserError: no network, no such repository, no access, a damaged file, or no model that `push`
@@ -126,7 +128,10 @@ def _check_file(path: Path, name: str) -> None:
         elif path.suffix == ".safetensors":
             with safe_open(path, framework="numpy"):
                 pass
-    except (ValueError, RecursionError, SafetensorError) as error:
+        elif path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as stored:
+                dict(stored)
+    except (ValueError, RecursionError, SafetensorError, OSError, BadZipFile) as error:
         raise UserError(f"{name} is damaged or no {path.suffix[1:]}: {error}") from error
 
 
