@@ -88,7 +88,7 @@ images: $(READY)
 	QT_QPA_PLATFORM=offscreen QTWEBENGINE_DISABLE_SANDBOX=1 PYTHONPATH=runs/images/browser \
 		$(BIN)/python docs/images.py runs/images
 
-# How the shipped touch encoder was made: about 45 minutes on 2 cores. Words come from the wand's objects and
+# How the shipped touch encoder was made: over an hour on 2 cores. Words come from the wand's objects and
 # from those of pick-and-place; normalizer, value and judge of rewards from runs of two experts with ten of them.
 REWARD_OBJECTS := glass_ball yarn_ball wooden_block cushion soda_can rope_coil candle corn_cob pebble rag_bundle
 REWARD_SETS := successes feedback failures

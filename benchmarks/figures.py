@@ -44,11 +44,11 @@ def looks(metrics: Metrics) -> str:
 
 
 def mended(metrics: Metrics) -> str:
-    """Success of every row, and how often the policy told that it had failed."""
+    """Success of every row, and in how many trials the policy gave up."""
     rows = []
     for row in metrics["rows"]:
-        told = sum(trial["failure"] == "gave up" for trial in row["trials"])
-        rows.append(f"{row['what'].split(', ')[1]} {_rate(row['trials'])}, {told} told")
+        gave_up = sum(trial["failure"] == "gave up" for trial in row["trials"])
+        rows.append(f"{row['what'].split(', ')[1]} {_rate(row['trials'])}, {gave_up} gave up")
     return "; ".join(rows)
 
 

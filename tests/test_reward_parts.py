@@ -148,7 +148,9 @@ def test_before_contact_the_fingertips_cost_the_same_whatever_they_read(
     parts = compute_curves(embedded(9), goal, normalizer).parts
     for name in ("object", "force", "centre", "held"):
         assert parts[name][:GRASP] == pytest.approx(np.ones(GRASP)), name
-    assert np.ptp(parts["fused"][:GRASP]) > 0.005  # the images lead
+    fused, others = parts["fused"], [cost for name, cost in parts.items() if name != "fused"]
+    assert fused == pytest.approx(np.sqrt(np.mean(np.square(others), axis=0)))
+    assert np.ptp(parts["wrist_map"][:GRASP]) > 0.05 and np.ptp(fused[:GRASP]) > 0  # images lead
     free = {**goal.features, "held": np.zeros((1, 2), bool)}
     costs = part_costs(embedded(9).features, free, normalizer.unit)
     assert costs["object"][:GRASP] == pytest.approx(np.zeros(GRASP)) and costs["object"][-1] < 0.5
