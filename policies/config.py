@@ -98,9 +98,9 @@ class PoseEstimatorConfig:
     keypoints: int = 16  # of each image, found by a spatial softmax
     keypoint_features: int = 32  # of each keypoint
     width: int = 256  # of the hidden layers that combine them
-    # Least share of the first look near the object and near the goal, and least length of the vector
-    # of the yaw, in which the estimate is trusted; training sets them.
-    sure: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # Least share of the first look near the object and near the goal, least length of the vector of the
+    # yaw, and least probability of an unmirrored image, in which the estimate is trusted; training sets them.
+    sure: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     # Most share of the first look at another place than the object's; training sets it. One such object
     # leaves at most 0.02 in 24 scenes, two or three at least 0.06 in 24.
     second: float = 1.0
@@ -111,7 +111,7 @@ class PoseEstimatorConfig:
 class PoseTrainConfig:
     """Training of the pose estimator, by AdamW."""
 
-    epochs: Count = 26
+    epochs: Count = 18
     """Passes over the placements."""
     batch_size: Count = 64
     """Placements in each step."""

@@ -16,7 +16,7 @@ from touchgoal.episodes.recording import CORRECTED, EpisodeSpec, record_episode
 from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig
-from touchgoal.policies.perception.placements import Placements, render_placements
+from touchgoal.policies.perception.placements import Placements, Variety, render_placements
 from touchgoal.policies.perception.pose_estimator import Look, PoseEstimator
 from touchgoal.policies.perception.pose_training import pose_errors, train_pose_estimator
 from touchgoal.policies.perception.state_estimation import (
@@ -57,7 +57,8 @@ def spots(count: int) -> Placements:
     sentence[objects == 1, 1] = -1
     pixels = {ft.FRONT: places.float()}
     named = tuple(f"the {colour} spot" for colour in SPOTS)
-    return Placements({ft.FRONT: images}, tcp, start, pixels, objects, sentence, named)
+    shift = torch.zeros(count, 3)
+    return Placements({ft.FRONT: images}, tcp, shift, start, pixels, objects, sentence, named)
 
 
 def test_contact_is_the_simulators_in_every_tick() -> None:
@@ -88,12 +89,13 @@ def test_a_hand_that_starts_elsewhere_than_in_training_is_refused() -> None:
 
 def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two looks must agree; a look that is not sure counts for nothing, a first one ends it."""
-    estimator = StateEstimator(PoseEstimator(replace(SMALL, sure=(0.3, 0.3, 0.5))).eval())
+    estimator = StateEstimator(PoseEstimator(replace(SMALL, sure=(0.3, 0.3, 0.5, 0.5))).eval())
     now = {"x": 0.0, "sure": 1.0}
 
     def look(*_: object) -> Look:
         start = torch.tensor([[now["x"], 0, 0, 1, 0, 0.3, 0.3]])
-        return Look(start, torch.full((1, 2), now["sure"]), torch.ones(1), {}, torch.zeros(1, 2))
+        sure, one = torch.full((1, 2), now["sure"]), torch.ones(1)
+        return Look(start, sure, one, one, {}, torch.zeros(1, 2))
 
     monkeypatch.setattr(PoseEstimator, "look", look)
     gel = np.full((120, 160, 3), 90, np.uint8)
@@ -117,7 +119,9 @@ def test_a_hand_tilted_by_a_thousandth_changes_no_estimate() -> None:
     images = {ft.FRONT: torch.full((1, 256, 256, 3), 90, dtype=torch.uint8)}
     hand, words = torch.tensor([[0.45, 0, 0.26, 0, 1, 0, 0]]), torch.zeros(1, WORDS_WIDTH)
     tilted = hand + torch.tensor([[0, 0, 0, 1e-3, 0, 0, 1e-3]])
-    torch.testing.assert_close(network(images, tilted, words), network(images, hand, words))
+    still = torch.zeros(1, 3)
+    found = (network(images, tcp, still, words) for tcp in (tilted, hand))
+    torch.testing.assert_close(*found)
 
 
 def train_pose(
@@ -140,7 +144,7 @@ def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
     tcp = placements.tcp[rows]
     for k, said in enumerate(("a red dot", "a blue dot")):
         words = embed([said]).expand(len(tcp), -1)
-        off = sight(images, tcp, words)[:, :2] - placements.start[rows, k, :2]
+        off = sight(images, tcp, placements.shift[rows], words)[:, :2] - placements.start[rows, k, :2]
         assert off.norm(dim=1).median() < 0.02  # 0.12 by chance
 
 
@@ -159,7 +163,9 @@ def test_a_sentence_fits_its_object_alone() -> None:
 
 def test_placements_say_where_each_object_is() -> None:
     config = PickPlaceConfig(cameras=("front",), camera_size=(256, 256), tactile=False)
-    placements = render_placements(config, 1, 12, seeds.POSE_VALIDATION.start, 1)
+    usual = Variety(covered=0, repainted=0)
+    placements = render_placements(config, 1, 12, seeds.POSE_VALIDATION.start, 1, usual)
+    assert placements.shift.any(1).any() and not placements.shift.any(1).all()
     assert len(placements) == 12 and placements.objects.unique().tolist()[-1] > 1
     for i, n in enumerate(placements.objects):
         assert (placements.sentence[i, n:] == -1).all()

@@ -13,11 +13,20 @@ from torch import Tensor
 from touchgoal.control import features as ft
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.policies.perception.target_words import COLOURS, Appearance, sentence
+from touchgoal.policies.perception.usual_view import UsualView
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.config import USUAL_CAMERA, PickPlaceConfig, SceneConfig
 from touchgoal.sim_envs.pick_place import WORKSPACE, Hand, PickPlace
 from touchgoal.sim_envs.scene.surroundings import USUAL, UsualScene, draw_surroundings
+from touchgoal.sim_envs.scene.variety import (
+    CALIBRATION_ERROR,
+    cover_table,
+    draw_placement,
+    measured_placement,
+    paint,
+    place_camera,
+)
 
 MOST = 4  # objects on the table
 _ALONE = 0.4  # share of the placements with one object
@@ -30,7 +39,12 @@ class Variety:
     """Shares of varied placements, or objects."""
 
     painted: float = 0.5  # objects of another colour than their kind's
-    surroundings: float = 0.7  # placements with another camera pose and light
+    covered: float = 0.4  # scenes whose table has a pattern
+    repainted: float = 0.5  # placements with table and disc of any colour, and a disc of any size
+    elsewhere: float = 0.4  # placements seen by a calibrated camera that stands elsewhere
+    surroundings: float = (
+        0.7  # other placements with another camera pose, and all with another light
+    )
     hand_anywhere: float = 0.2  # placements with the hand anywhere over the table
     hand_over: float = 0.3  # placements with it over an object, as when an episode looks again
 
@@ -44,6 +58,7 @@ class Placements:
 
     images: dict[str, UInt8[Tensor, "n h w 3"]]  # camera images by column
     tcp: Float32[Tensor, "n 7"]  # pose of the hand, `features.TCP_POSE`
+    shift: Float32[Tensor, "n 3"]  # of the calibrated front camera from the usual one, m
     start: Float32[Tensor, "n k 7"]  # true poses with each as target, `features.TRUTH_START`
     # of each object's centre, and last of the goal's, in each camera image: row and column, px
     pixels: dict[str, Float32[Tensor, "n k+1 2"]]
@@ -85,6 +100,7 @@ def render_placements(
     return Placements(
         images=images,
         tcp=_column(rows, ft.TCP_POSE),
+        shift=_column(rows, "shift"),
         start=_column(rows, "start"),
         pixels={key: _column(rows, f"pixels.{key}") for key in keys},
         objects=torch.tensor([row["objects"] for row in rows]),
@@ -97,48 +113,82 @@ def _column(rows: list[dict[str, Any]], key: str) -> Tensor:
     return torch.from_numpy(np.stack([row[key] for row in rows]))
 
 
+class _CoveredTable(PickPlace):
+    """Pick-and-place on a table with a pattern."""
+
+    def scene(self, config: SceneConfig) -> Any:
+        spec = super().scene(config)
+        cover_table(spec, self.np_random)
+        return spec
+
+
 def _render_scene(
     config: PickPlaceConfig, placements_each: int, variety: Variety, seed: int
 ) -> list[dict[str, Any]]:
-    env = PickPlace(config)
+    covered = np.random.default_rng(seed).random() < variety.covered
+    env = (_CoveredTable if covered else PickPlace)(config)
     env.reset(seed=seed)
     rng = env.np_random.spawn(1)[0]
     scene, rows = UsualScene.of(env.model), []
+    looks = [env.model.geom("table").rgba, env.model.geom("goal").rgba, env.model.geom("goal").size]
+    usual = [look.copy() for look in looks]
     for _ in range(placements_each):
-        changed = rng.random() < variety.surroundings
+        elsewhere = rng.random() < variety.elsewhere
+        changed = elsewhere or rng.random() < variety.surroundings
         scene.change(env.model, draw_surroundings(rng) if changed else USUAL)
-        rows.append(_render_placement(env, rng, variety))
+        if elsewhere:
+            camera = draw_placement(config.front_camera or USUAL_CAMERA, WORKSPACE, rng)
+            place_camera(env.model, camera)
+        for look, before in zip(looks, usual, strict=True):
+            look[:] = before
+        if rng.random() < variety.repainted:
+            paint(env.model, rng)
+        rows.append(_render_placement(env, rng, variety, elsewhere))
     env.close()
     return rows
 
 
-def _render_placement(env: PickPlace, rng: np.random.Generator, variety: Variety) -> dict[str, Any]:
+def _render_placement(
+    env: PickPlace, rng: np.random.Generator, variety: Variety, elsewhere: bool
+) -> dict[str, Any]:
     """Paint some objects, hide others, move all of them, and render them."""
     count = 1 if rng.random() < _ALONE else int(rng.integers(2, MOST + 1))
     order = rng.permutation(MOST)
     shown = [env.bodies[i] for i in order[:count]]
     looks = []
     for body in env.bodies:
-        rgb, paint = np.array(body.kind.material.rgba[:3]), bool(rng.random() < variety.painted)
-        if paint:
+        rgb, painted = np.array(body.kind.material.rgba[:3]), bool(rng.random() < variety.painted)
+        if painted:
             name = list(COLOURS)[rng.integers(len(COLOURS))]
             rgb = np.clip(rng.normal(COLOURS[name], _COLOUR_NOISE), 0, 1)
         env.model.geom(body.name).rgba[:] = *rgb, float(body in shown)
         if body in shown:
-            looks.append(Appearance(body.kind, rgb, paint))
+            looks.append(Appearance(body.kind, rgb, painted))
     shown.sort(key=env.bodies.index)
     observation, _ = env.rearrange(_draw_hand(env, rng, order[:count], variety))
     row: dict[str, Any] = dict(observation)
     starts = np.stack([env.start_of(body.name) for body in shown])
     row["start"], row["objects"] = _padded(starts), count
-    goal = np.append(env.goal, 0.0)
+    points = [*starts[:, :3], np.append(env.goal, 0.0)]
     for camera in env.config.cameras:
-        seen = np.stack([_pixel(env, camera, pose[:3]) for pose in starts])
-        both = np.concatenate([_padded(seen), _pixel(env, camera, goal)[None]])
-        row[f"pixels.{ft.IMAGE_PREFIX}{camera}"] = both.astype(np.float32)
+        key = ft.IMAGE_PREFIX + camera
+        seen = np.stack([_pixel(env, camera, point) for point in points])
+        row[f"pixels.{key}"] = np.concatenate([_padded(seen[:-1]), seen[-1:].astype(np.float32)])
+    row["shift"] = np.zeros(3, np.float32)
+    if elsewhere:
+        _see_as_usual(row, env, rng)
     words = [sentence(rng, look, [*looks[:i], *looks[i + 1 :]]) for i, look in enumerate(looks)]
     row["words"] = [*words, *[None] * (MOST - count)]
     return row
+
+
+def _see_as_usual(row: dict[str, Any], env: PickPlace, rng: np.random.Generator) -> None:
+    """Replace the front image by what the usual camera would see, by the camera's calibration."""
+    here = measured_placement(env.model, env.data, CALIBRATION_ERROR, rng)
+    usual, pixels = env.config.front_camera or USUAL_CAMERA, f"pixels.{ft.FRONT}"
+    view, image = UsualView(usual, here, env.config.camera_size), row[ft.FRONT]
+    row[pixels] = np.stack([view.seen(place, image) for place in row[pixels]]).astype(np.float32)
+    row[ft.FRONT], row["shift"] = view(image), view.shift.astype(np.float32)
 
 
 def _draw_hand(

@@ -27,6 +27,7 @@ _PEAK = 1.5  # cells around a map's maximum over which the place is averaged
 _APART = 3.0  # cells between a place and the next one
 # Centre of the first cell, px: that of the 8 pixels of its patch, which begin at -2.
 _FIRST = 1.5
+_SHIFT = 0.1  # m, unit of the camera's shift
 _BRIGHTNESS, _MOST_GAIN = 110.0, 6.0  # grey levels of 255, the mean of the usual image
 
 Images = dict[str, UInt8[Tensor, "b h w 3"]]
@@ -42,14 +43,15 @@ class Look:
     found: Float[Tensor, "b 2"]  # share of the scores near the object and near the goal, in [0, 1]
     # Length of (cos, sin) of twice the yaw: 1 if sure, less where two yaws are as likely.
     turned: Float[Tensor, " b"]
+    unmirrored: Float[Tensor, " b"]  # probability that left is left in the image
     places: Places
     # share of the scores near the likeliest other place of the object, and of the goal
     second: Float[Tensor, "b 2"]
 
     @property
-    def sureness(self) -> tuple[float, float, float]:
-        """How sure the network is of the first image: see `PoseEstimatorConfig.sure`."""
-        return (*self.found[0].tolist(), float(self.turned[0]))
+    def sureness(self) -> Float[Tensor, "b 4"]:
+        """How sure the network is of each image: see `PoseEstimatorConfig.sure`."""
+        return torch.cat([self.found, self.turned[:, None], self.unmirrored[:, None]], 1)
 
 
 class PoseEstimator(nn.Module):
@@ -70,24 +72,34 @@ class PoseEstimator(nn.Module):
             dilations=config.dilations[::2],
         )
         self.scenes = nn.ModuleList(_SpatialSoftmax(half) for _ in config.crops)
-        points = (config.keypoints + config.scene_keypoints) * len(config.crops)
-        width = _TCP + points * (2 + config.keypoint_features)
+        seen = (
+            _TCP + 3 + config.scene_keypoints * len(config.crops) * (2 + config.keypoint_features)
+        )
+        width = seen + config.keypoints * len(config.crops) * (2 + config.keypoint_features)
         self.tcp_normalizer, self.start_normalizer = Normalizer((_TCP,)), Normalizer((_START,))
         self.heads = nn.ModuleList(readout(width, config.width, part) for part in _PARTS)
+        self.unmirrored = readout(seen, config.width // 4, 1)
 
     def forward(
-        self, images: Images, tcp: Float[Tensor, "b 7"], words: Float[Tensor, "b d"]
+        self,
+        images: Images,
+        tcp: Float[Tensor, "b 7"],
+        shift: Float[Tensor, "b 3"],
+        words: Float[Tensor, "b d"],
     ) -> Float[Tensor, "b 7"]:
         """Return the estimate: m, base frame.
 
-        `words` are `target_words.embed`; zeros without a sentence, where one object is there.
+        `shift` is of a calibrated front camera, see `UsualView`, 0 if unknown. `words` are
+        `target_words.embed`; zeros without a sentence, where one object is there.
         """
         lit = evenly_lit(images)
-        return self.look(lit, words, self.scene(lit, tcp)).start
+        return self.look(lit, words, self.scene(lit, tcp, shift)).start
 
-    def scene(self, lit: Images, tcp: Float[Tensor, "b 7"]) -> Float[Tensor, "b s"]:
-        """Encode the camera's pose from the whole image and the hand's pose."""
-        known = [self.tcp_normalizer(tcp)]
+    def scene(
+        self, lit: Images, tcp: Float[Tensor, "b 7"], shift: Float[Tensor, "b 3"]
+    ) -> Float[Tensor, "b s"]:
+        """Encode the camera's pose from the whole image, the hand's pose and the camera's shift."""
+        known = [self.tcp_normalizer(tcp), shift / _SHIFT]
         for (key, _), scene in zip(self.config.crops, self.scenes, strict=True):
             halved = lit[key][:, ::2, ::2]
             middle = torch.tensor(halved.shape[1:3], device=tcp.device) / 2
@@ -101,7 +113,8 @@ class PoseEstimator(nn.Module):
         places = {key: place for key, (place, _, _) in found.items()}
         start = self.start_normalizer.inverse(self.scaled(lit, scene, places))
         surest, second = (torch.stack([f[i] for f in found.values()]).amax(0) for i in (1, 2))
-        return Look(start, surest, start[:, 3:5].norm(dim=1), places, second)
+        turned, unmirrored = start[:, 3:5].norm(dim=1), self.unmirrored(scene)[:, 0].sigmoid()
+        return Look(start, surest, turned, unmirrored, places, second)
 
     def scores(
         self, images: Images, words: Float[Tensor, "b d"]
@@ -243,7 +256,10 @@ class _SpatialSoftmax(nn.Module):
             ]
         )
         maps = F.relu(self.surroundings(self.patches(_pixels(crops))))
-        points = keypoints(self.attention(maps), self.features(maps)).unflatten(1, (self.count, -1))
+        attention, features = self.attention(maps), self.features(maps)
+        with torch.autocast(images.device.type, enabled=False):  # bfloat16 knows places to 1 px
+            found = keypoints(attention.float(), features.float())
+        points = found.unflatten(1, (self.count, -1))
         within, features = points.split([2, points.shape[2] - 2], 2)
         reach = (self.side - _PATCH) / 2  # px from the crop's middle to its outermost cells
         px = corner.flip(1)[:, None] + _FIRST + reach * (within + 1)

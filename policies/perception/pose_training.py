@@ -56,6 +56,7 @@ def train_pose_estimator(
                 }
             ),
             "tcp": placements.tcp[rows],
+            "shift": placements.shift[rows],
             "start": placements.start[rows, target],
             "places": {  # px, of the target and of the goal
                 key: torch.stack([pixels[rows, target], pixels[rows, -1]], 1)
@@ -77,7 +78,7 @@ def train_pose_estimator(
         identity={
             "train": asdict(config),
             "pose_estimator": asdict(estimator.config),
-            "data": checksum(*tensors, placements.tcp, placements.start, placements.sentence),
+            "data": checksum(*tensors, placements.tcp, placements.shift, placements.start),
         },
         progress=lambda m: f"pose: loss {m['pose']:.4f}, first look {m['find']:.3f}",
     )
@@ -94,6 +95,7 @@ class _PoseLoss(nn.Module):
         self,
         images: dict[str, Tensor],
         tcp: Tensor,
+        shift: Tensor,
         start: Tensor,
         places: dict[str, Tensor],
         words: Tensor,
@@ -101,7 +103,7 @@ class _PoseLoss(nn.Module):
         off: Tensor,
     ) -> dict[str, Tensor]:
         near = {key: place + off for key, place in places.items()}
-        scene = self.estimator.scene(images, tcp)
+        scene = self.estimator.scene(images, tcp, shift)
         predicted = self.estimator.scaled(images, scene, near)
         target = self.estimator.start_normalizer(start)
         pose = F.smooth_l1_loss(predicted, target, beta=_HUBER_BETA)
@@ -111,7 +113,13 @@ class _PoseLoss(nn.Module):
         find = torch.stack(
             [_find_loss(scores[k], shares[k], unambiguous[few]) for k in scores]
         ).sum()
-        return {"loss": pose + find, "pose": pose, "find": find}
+        mirrored = {key: image[few].flip(2) for key, image in images.items()}
+        seen = scene[few], self.estimator.scene(mirrored, tcp[few], shift[few])
+        logits = torch.cat([self.estimator.unmirrored(s)[:, 0] for s in seen])
+        left = F.binary_cross_entropy_with_logits(
+            logits, (torch.arange(len(logits)) < len(seen[0])).to(logits)
+        )
+        return {"loss": pose + find + left / 4, "pose": pose, "find": find, "mirrored": left}
 
 
 def _find_loss(
@@ -162,21 +170,21 @@ def _add_pixel_noise(
 @torch.no_grad()
 def fit_sure(
     estimator: PoseEstimator, placements: Placements
-) -> tuple[tuple[float, float, float], dict[str, float]]:
+) -> tuple[tuple[float, float, float, float], dict[str, float]]:
     """Return `PoseEstimatorConfig.sure`, and the shares of good and of bad estimates refused by it.
 
-    Each number refuses a third of the 2 % of good estimates that may be refused; a bad one is off by
+    Each number refuses a quarter of the 2 % of good estimates that may be refused; a bad one is off by
     2 cm or 20 degrees. Only objects that a sentence identifies, or that stand alone, count.
     """
     sure, good = [], []
     for rows, target, words in _targets(placements):
         found, true = _look(estimator, placements, rows, words), placements.start[rows, target]
-        sure.append(torch.cat([found.found, found.turned[:, None]], 1))
+        sure.append(found.sureness)
         off = (found.start - true)[:, :2].norm(dim=1)
         good.append((off < _BAD[0]) & (_yaw_error(found.start, true) < _BAD[1]))
     shares, fine = torch.cat(sure), torch.cat(good)
     if not fine.any():  # without a good estimate there is no threshold
-        return (0.0, 0.0, 0.0), {"good": 0.0, "bad": 0.0}
+        return (0.0, 0.0, 0.0, 0.0), {"good": 0.0, "bad": 0.0}
     least = shares[fine].quantile(_FALSE_REFUSALS / shares.shape[1], dim=0)
     refused = (shares < least).any(1).float()
     known = {"good": refused[fine].mean().item(), "bad": refused[~fine].sum().item()}
@@ -229,8 +237,9 @@ def _look(
     looks = []
     for some, chosen in zip(rows.split(_BATCH), words.split(_BATCH), strict=True):
         lit = evenly_lit({key: images[some] for key, images in placements.images.items()})
-        looks.append(estimator.look(lit, chosen, estimator.scene(lit, placements.tcp[some])))
-    names = ("start", "found", "turned", "second")
+        scene = estimator.scene(lit, placements.tcp[some], placements.shift[some])
+        looks.append(estimator.look(lit, chosen, scene))
+    names = ("start", "found", "turned", "unmirrored", "second")
     joined = {name: torch.cat([getattr(o, name) for o in looks]) for name in names}
     places = {key: torch.cat([o.places[key] for o in looks]) for key in looks[0].places}
     return Look(places=places, **joined)

@@ -26,12 +26,17 @@ ESTIMATOR_FORMAT = WeightsFormat(
     "estimator", "pose estimator", "train one with: touchgoal train-pose-estimator"
 )
 _FARTHEST = 4.0  # standard deviations of the hand's start in training
-# m. A camera farther from the training's than there is not what the network knows; else its places lie
-# at most the second distance from the image's: a degree of a calibration's error is 16 mm.
-_ELSEWHERE, _APART = 0.03, 0.04
+# m, between the network's places and those that the calibrated camera sees: a degree of a calibration's
+# error is 16 mm.
+_APART = 0.04
 _PLACES = [0, 1, 5, 6]  # x and y of the object and of the goal in `features.TRUTH_START`
 _OBJECT = 5  # numbers of `features.TRUTH_START` on the object
-_ASKED = ("where the object is", "where the disc is", "how the object is turned")
+_ASKED = (
+    "where the object is",
+    "where the disc is",
+    "how the object is turned",
+    "which side of the image is left",
+)
 # m. The object has moved if two later estimates agree within the first distance and lie the second
 # one away from the known place. A hand nearer than the third distance hides too much.
 _AGREE, _MOVED, _NEAREST = 0.006, 0.014, 0.04
@@ -96,9 +101,11 @@ class StateEstimator:
         tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
         self._check_hand(tcp)
         images = self._images(first)
-        self._scene = self.pose_estimator.scene(images, tcp)
+        view = self._views.get(ft.FRONT)
+        shift = torch.zeros(1, 3) if view is None else torch.from_numpy(view.shift[None]).float()
+        self._scene = self.pose_estimator.scene(images, tcp, shift)
         look = self.pose_estimator.look(images, self._words, self._scene)
-        for what, sure, least in zip(_ASKED, look.sureness, self._least, strict=True):
+        for what, sure, least in zip(_ASKED, look.sureness[0].tolist(), self._least, strict=True):
             if sure < least:
                 raise RefusedError(
                     f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): put "
@@ -109,7 +116,7 @@ class StateEstimator:
             raise RefusedError(
                 f"several objects may be {meant}: say which one, so that it fits no other (--target)"
             )
-        self._start = self._latest = self._where(look)
+        self._start = self._latest = look.start[0].numpy().copy()
         self._check_camera(look, first)
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
         self._first, self._touched = first, False
@@ -121,20 +128,15 @@ class StateEstimator:
         The camera's pose is taken from the first images, in which nothing moves.
         """
         look = self.pose_estimator.look(self._images(observation), self._words, self._scene)
-        if any(sure < least for sure, least in zip(look.sureness, self._least, strict=True)):
+        if any(
+            sure < least for sure, least in zip(look.sureness[0].tolist(), self._least, strict=True)
+        ):
             return
-        now, before = self._where(look), self._latest
+        now, before = look.start[0].numpy().copy(), self._latest
         self._latest = now
         moved = np.linalg.norm(now[:2] - self._start[:2]) > _MOVED
         if moved and np.linalg.norm(now[:2] - before[:2]) < _AGREE:
             self._start = np.concatenate([(now + before)[:_OBJECT] / 2, self._start[_OBJECT:]])
-
-    def _where(self, look: Look) -> Float32[np.ndarray, "7"]:
-        """Return `features.TRUTH_START`; places from the view of a camera that stands elsewhere."""
-        start, view = look.start[0].numpy().copy(), self._views.get(ft.FRONT)
-        if view is not None and view.elsewhere > _ELSEWHERE:
-            start[_PLACES] = self._projected(view, look)
-        return start
 
     def _projected(self, view: UsualView, look: Look) -> Float32[np.ndarray, "4"]:
         """Return places of object and goal, x and y (m), by where they are in the image."""

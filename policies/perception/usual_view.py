@@ -25,25 +25,32 @@ class UsualView:
     size: tuple[int, int]  # rows and columns of the usual images, px
 
     @property
-    def elsewhere(self) -> float:
-        """Distance between the cameras, m."""
-        return float(np.linalg.norm(np.subtract(self.here[:3], self.usual[:3])))
+    def shift(self) -> Float[np.ndarray, "3"]:
+        """From the usual camera to the one here, m, base frame."""
+        return np.subtract(self.here[:3], self.usual[:3])
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "y x 3"]:
         """Return the usual camera's image; what the camera here does not see is its nearest pixel."""
         if self.here == self.usual and image.shape[:2] == self.size:
             return image
-        homography = _from_table(self.here, *image.shape[:2]) @ self._to_table
+        homography = self._to_here(*image.shape[:2])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return cv2.warpPerspective(
             image, homography, self.size[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE
         )
 
+    def seen(
+        self, place: Float[np.ndarray, "2"], image: UInt8[np.ndarray, "h w 3"]
+    ) -> Float[np.ndarray, "2"]:
+        """Return the row and column (px) in the usual image of a place in the camera's own image."""
+        inverse = np.linalg.inv(self._to_here(*image.shape[:2]))
+        column, row, scale = inverse @ np.array([place[1] - 0.5, place[0] - 0.5, 1.0])
+        return np.array([row, column]) / scale + 0.5
+
     def shows(self, seen: Float[np.ndarray, "2"], image: UInt8[np.ndarray, "h w 3"]) -> bool:
         """Return whether the camera's own image shows what is around a place of the usual image, px."""
         rows, columns = image.shape[:2]
-        homography = _from_table(self.here, rows, columns) @ self._to_table
-        column, row, scale = homography @ np.array([seen[1], seen[0], 1.0])
+        column, row, scale = self._to_here(rows, columns) @ np.array([seen[1], seen[0], 1.0])
         margin = _MARGIN * rows
         inside = margin < row / scale < rows - margin
         return bool(scale > 0 and inside and margin < column / scale < columns - margin)
@@ -59,6 +66,10 @@ class UsualView:
         share = (self.here[2] - height) / (self.here[2] - _HEIGHT)
         eye = np.array(self.here[:2])
         return eye + share * (on_plane[:2] / on_plane[2] - eye)
+
+    def _to_here(self, rows: int, columns: int) -> Float[np.ndarray, "3 3"]:
+        """Return the homography from the usual image to the camera's own, of pixel centres."""
+        return _from_table(self.here, rows, columns) @ self._to_table
 
     @property
     def _to_table(self) -> Float[np.ndarray, "3 3"]:

@@ -7,11 +7,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy.spatial.transform import Rotation
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
-from touchgoal.control.motion.rotations import fingers_down, rotation_matrix
+from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.deployed_arm import DeployedArm
@@ -28,10 +27,10 @@ from touchgoal.sim_envs.config import (
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, PadContact
 from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.scene.surroundings import USUAL
+from touchgoal.sim_envs.scene.variety import CALIBRATION_ERROR, measured_placement
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 
 DISTURBANCE_SECONDS = 0.5  # s for which a disturbance keeps its direction
-_CALIBRATION_ERROR = 0.005, np.radians(1.0)  # m and rad, RMS
 
 
 class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
@@ -332,13 +331,9 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         if config.front_camera is None and turned == (USUAL.camera_turn, USUAL.camera_shift):
             return USUAL_CAMERA
         drawn: Any = self.np_random.bit_generator.seed_seq  # of the last seed given to reset
-        camera, rng = self.data.camera("front"), np.random.default_rng(drawn.entropy)
-        off = _CALIBRATION_ERROR if config.as_deployed else (0.0, 0.0)
-        place, turn = (rng.normal(0, rms / np.sqrt(3), 3) for rms in off)
-        # Half a turn about x: MuJoCo's cameras look along -z and have y up.
-        R = rotation_matrix(turn) @ camera.xmat.reshape(3, 3) @ np.diag([1, -1, -1])
-        w, x, y, z = Rotation.from_matrix(R).as_quat(scalar_first=True)
-        return (*(camera.xpos + place), w, x, y, z, float(self.model.camera("front").fovy[0]))
+        rng = np.random.default_rng(drawn.entropy)
+        off = CALIBRATION_ERROR if config.as_deployed else (0.0, 0.0)
+        return measured_placement(self.model, self.data, off, rng)
 
     @property
     def plan_ticks(self) -> int:

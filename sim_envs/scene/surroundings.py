@@ -11,8 +11,8 @@ from touchgoal.runtime.option_types import checked_dataclass
 
 Degrees = Annotated[float, Field(ge=-45, le=45)]
 Metres = Annotated[float, Field(ge=-1, le=1)]
-_MOST_TURN, _MOST_SHIFT, _MOST_LAMP = 7.0, 0.03, 0.4  # of `draw_surroundings`, degrees and m
-_DIMMEST, _BRIGHTEST = 0.15, 1.3  # of `draw_surroundings`, shares of the usual light
+_MOST_TURN, _MOST_SHIFT, _MOST_LAMP = 7.0, 0.03, 1.0  # of `draw_surroundings`, degrees and m
+_DIMMEST, _BRIGHTEST = 0.15, 2.0  # of `draw_surroundings`, shares of the usual light
 
 
 @checked_dataclass
@@ -33,7 +33,7 @@ USUAL = Surroundings()
 
 
 def draw_surroundings(rng: np.random.Generator) -> Surroundings:
-    """Draw surroundings within 7 degrees, 3 cm, 0.4 m of the lamp, and 0.15 to 1.3 of the light."""
+    """Draw surroundings within 7 degrees, 3 cm, 1 m of the lamp, and 0.15 to 2 of the light."""
     yaw, pitch = rng.uniform(-_MOST_TURN, _MOST_TURN, 2)
     x, y, z = rng.uniform(-_MOST_SHIFT, _MOST_SHIFT, 3)
     a, b, c = rng.uniform(-_MOST_LAMP, _MOST_LAMP, 3)
@@ -47,6 +47,7 @@ class UsualScene:
 
     eye: Float[np.ndarray, "3"]  # place of the front camera, m
     quat: Float[np.ndarray, "4"]  # its orientation, wxyz
+    lens: float  # its vertical field of view, degrees
     lamp: Float[np.ndarray, "3"]  # place of the lamp that casts shadows, m
     light: tuple[Float[np.ndarray, "..."], ...]  # see `_light`
 
@@ -55,7 +56,8 @@ class UsualScene:
         """Note those of an unchanged MjModel."""
         camera = model.camera("front")
         light = tuple(a.copy() for a in _light(model))
-        return cls(camera.pos.copy(), camera.quat.copy(), model.light_pos[0].copy(), light)
+        lamp, lens = model.light_pos[0].copy(), float(camera.fovy[0])
+        return cls(camera.pos.copy(), camera.quat.copy(), lens, lamp, light)
 
     def change(self, model: Any, surroundings: Surroundings) -> None:
         """Change the model; `surroundings` replace those of earlier calls."""
@@ -65,7 +67,7 @@ class UsualScene:
         turn, camera = np.empty(4), model.camera("front")
         mujoco.mju_euler2Quat(turn, np.array([-right, up, 0]), "yxz")  # its x is right, y up
         mujoco.mju_mulQuat(camera.quat, self.quat, turn)
-        camera.pos[:] = self.eye + surroundings.camera_shift
+        camera.pos[:], camera.fovy[:] = self.eye + surroundings.camera_shift, self.lens
         model.light_pos[0] = self.lamp + surroundings.lamp_shift
         for now, usual in zip(_light(model), self.light, strict=True):
             now[:] = (1 + surroundings.room_light) * usual
