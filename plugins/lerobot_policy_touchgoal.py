@@ -57,7 +57,7 @@ class TouchgoalPolicy(PreTrainedPolicy):
         rows = len(next(iter(observed.values())))
         self._actors += [self._saved() for _ in range(rows - len(self._actors))]
         actions = [
-            actor.act({key: _as_recorded(key, value[i]) for key, value in observed.items()})
+            actor.act({key: as_recorded(key, value[i]) for key, value in observed.items()})
             for i, actor in enumerate(self._actors)
         ]
         return torch.from_numpy(np.stack(actions))
@@ -68,10 +68,10 @@ class TouchgoalPolicy(PreTrainedPolicy):
     forward = predict_action_chunk = get_optim_params = _refuse
 
 
-def _as_recorded(key: str, value: Tensor) -> np.ndarray:
-    """Return a value as touchgoal observes it: images uint8 (h, w, 3), not float (3, h, w)."""
+def as_recorded(key: str, value: Tensor) -> np.ndarray:
+    """Return a value as touchgoal observes it: images uint8 (..., h, w, 3), not float (..., 3, h, w)."""
     if key.startswith(IMAGE_PREFIX):
-        return (255 * value).round().byte().permute(1, 2, 0).contiguous().cpu().numpy()
+        return (255 * value).round().byte().movedim(-3, -1).contiguous().cpu().numpy()
     return value.float().cpu().numpy()
 
 

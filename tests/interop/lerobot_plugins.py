@@ -1,5 +1,5 @@
-"""touchgoal's policy in touchgoal's environment by lerobot-eval, against touchgoal's own loop; a twin's
-arm and a fingertip through lerobot's interfaces.
+"""touchgoal's policy in touchgoal's environment by lerobot-eval, against touchgoal's own loop; its reward, a
+twin's arm and a fingertip through lerobot's interfaces.
 
     python tests/interop/lerobot_plugins.py PYTHON      PYTHON: of an environment with lerobot
 
@@ -16,6 +16,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
+import numpy as np  # noqa: E402
 from running_twin import RunningTwin  # noqa: E402
 
 import touchgoal  # noqa: E402
@@ -33,6 +34,17 @@ def run_with_plugins(folder: Path, *command: str | Path) -> str:
     done = subprocess.run(command, env=os.environ | path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
+
+
+def record_with_costs(folder: Path) -> list[tuple[Path, Path]]:
+    """Record an episode by the expert; return its set and a file with its costs by touchgoal."""
+    command = [sys.executable, "-m", "touchgoal.launch", "collect-demos", "--episodes", "1"]
+    command += ["--env.objects", "wooden_block", "--out", str(folder / "demo")]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    root, costs = folder / "demo" / "episodes", folder / "costs.npy"
+    [curves] = touchgoal.Reward.of_judge("gelsight_mini")(root)
+    np.save(costs, curves.costs["fused"])
+    return [(root, costs)]
 
 
 def evaluate_with_lerobot(python: Path, plugins: Path, out: Path) -> list[tuple[float, bool]]:
@@ -80,6 +92,8 @@ def main() -> None:
         (folder / "twin").mkdir()
         with closing(RunningTwin(TWIN, folder / "twin", 0)) as twin:
             print(run_with_plugins(plugins, python, HERE / "lerobot_arm.py", twin.cell_file))
+        for out in record_with_costs(folder):
+            print(run_with_plugins(plugins, python, HERE / "lerobot_reward.py", *out))
         theirs = evaluate_with_lerobot(python, plugins, folder / "eval")
     here = evaluate_here()
     print(f"{'seed':>6}{'lerobot-eval':>14}{'success':>9}{'touchgoal':>11}{'success':>9}")
