@@ -24,7 +24,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Print the report; UserError, so exit code 1, if something required is missing."""
-    checks = (_python, _opengl, _robot, _device, _towers, _weights, _cameras, _arms)
+    checks = (_python, _opengl, _device, _towers, _weights, _cameras, _arms)
     results = [check() for check in checks]
     for result in results:
         if not config.quiet or result.ok is False:
@@ -51,12 +51,6 @@ def _opengl() -> CheckResult:
         return CheckResult("OpenGL", True, "renders off-screen")
     reason = (probe.stderr.strip().splitlines() or ["crashed"])[-1]
     return CheckResult("OpenGL", False, reason[:80], f"sudo apt-get install {OPENGL_PACKAGES}")
-
-
-def _robot() -> CheckResult:
-    found = importlib.util.find_spec("franky_sim") is not None
-    remedy = "" if found else "pip install franky-sim"
-    return CheckResult("FR3 model", found, f"franky-sim {_version('franky-sim')}", remedy)
 
 
 def _device() -> CheckResult:

@@ -44,10 +44,11 @@ def run(config: Config) -> dict[str, Any]:
 
 def _physics(config: Config) -> list[Row]:
     n = config.physics_steps
-    peer = mujoco.MjModel.from_xml_string(_franky_sim_model())
+    peer = mujoco.MjModel.from_xml_path(str(robot_model()))
+    peer.opt.timestep = 1e-3
     peer_data = mujoco.MjData(peer)
     mujoco.mj_resetDataKeyframe(peer, peer_data, 0)
-    rows = [_rate("peer: bare FR3 of the wheel, its own settings", config, n, peer, peer_data)]
+    rows = [_rate("peer: bare FR3, its maker's settings", config, n, peer, peer_data)]
     env = PickPlace(PickPlaceConfig(cameras=(), tactile=False))
     for name, ticks in (("object on the table", 0), ("object held in the air", TICKS_UNTIL_HELD)):
         _reset_and_run_expert(env, ticks)
@@ -104,13 +105,6 @@ def _reset_and_run_expert(env: PickPlace, ticks: int, name: str = "soda_can") ->
     expert = PickPlaceExpert(env)
     for _ in range(ticks):
         env.step(expert.act({}))
-
-
-def _franky_sim_model() -> str:
-    spec = mujoco.MjSpec.from_file(str(robot_model()))
-    spec.meshdir = str(robot_model().parent / "meshes")
-    spec.option.timestep = 1e-3
-    return spec.to_xml()
 
 
 def _rate(what: str, config: Config, n: int, model: mujoco.MjModel, data: mujoco.MjData) -> Row:

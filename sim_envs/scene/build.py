@@ -3,28 +3,23 @@
 World frame = the robot's base frame, table top at z = 0.
 """
 
-import importlib.util
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int
 
 from touchgoal.control.motion.tool import FRANKA_HAND, SENSOR_BELOW_CARRIAGE, Tool
 from touchgoal.control.motion.tracker import SERVO_DAMPING
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
-from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import MAX_CAMERA_SIDE, SceneConfig
 from touchgoal.sim_envs.scene.objects import FIRM, Body
 
 SIDES = ("left", "right")
 OBJECT_GROUP, VISUAL_GROUP, HIDDEN_GROUP = 1, 2, 3
 GRIPPER_MAX_FORCE = 80.0  # N, both fingers; opening never needs a limit below it
-
-_DETAIL = 2e-3  # m: cubes in which corners of the full meshes are merged
 
 _UR5E = Path(__file__).with_name("ur5e.xml")
 ROBOTS = {"fr3": limits.FR3, "ur5e": limits.UR5E}
@@ -35,11 +30,8 @@ _STIFFNESS = {  # N m/rad: Franka's default (fr3.xml), stiff enough for the UR5e
 
 
 def robot_model() -> Path:
-    """Return the FR3's MJCF in the franky-sim wheel, without importing it (and pinocchio)."""
-    found = importlib.util.find_spec("franky_sim")
-    if found is None or found.origin is None:
-        raise UserError("the FR3 model is missing; run: pip install franky-sim")
-    return Path(found.origin).parent / "assets" / "fr3.xml"
+    """Return the FR3's MJCF; `docs/fr3_model.py` made it and its meshes."""
+    return Path(__file__).parent / "fr3" / "fr3.xml"
 
 
 def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpec:
@@ -70,7 +62,6 @@ def _robot(arm: str, meshes: str) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_file(str(_UR5E))
     else:
         spec = mujoco.MjSpec.from_file(str(robot_model()))
-        spec.meshdir = str(robot_model().parent / "meshes")
         # No posture brings these together (none of 20,000 random ones did), but they lie so near
         # that the solver would examine each pair in every step.
         for i, k in ((0, 2), (2, 4), (3, 5)):
@@ -109,7 +100,7 @@ def set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
 
 
 def _strip(spec: mujoco.MjSpec, fast: bool) -> None:
-    """Remove keyframes, servos and finger shapes of the wheel's model."""
+    """Remove keyframes, servos and finger shapes of the maker's model."""
     for item in [*spec.keys, *spec.actuators]:
         spec.delete(item)
     for side in SIDES:
@@ -129,8 +120,6 @@ def _strip(spec: mujoco.MjSpec, fast: bool) -> None:
     used = {geom.meshname for body in spec.bodies for geom in body.geoms}
     for mesh in [m for m in spec.meshes if m.name not in used]:
         spec.delete(mesh)
-    if not fast:
-        merge_corners(spec, {name for name in used if not name.endswith("_coll")}, _DETAIL)
 
 
 def _compensate_gravity(body: mujoco.MjsBody) -> None:
@@ -234,7 +223,7 @@ def _add_actuators(spec: mujoco.MjSpec, arm: str) -> None:
             **affine,
         )
     # One servo on the mean finger opening, stiff enough that the force clamp, set at run time to
-    # the grasp force, is what it delivers; the wheel's own hand is a 100 N/m spring.
+    # the grasp force, is what it delivers; the model's own hand is a 100 N/m spring.
     stiffness, damping = 2.0e4, 200.0
     spec.add_actuator(
         name="gripper",
@@ -337,48 +326,3 @@ def look_at(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) 
     x = np.cross(up, z)
     x = x / np.linalg.norm(x)
     return _quaternion(x, np.cross(z, x), z)
-
-
-_FEWEST = 100  # triangles; a mesh that would have fewer stays as it is
-
-
-def merge_corners(spec: mujoco.MjSpec, names: set[str], size: float) -> None:
-    """Merge the corners of named meshes that lie in one cube of `size` m (Rossignac, Borrel 1993).
-
-    In software OpenGL, most of an image's time goes to triangles smaller than a pixel.
-    """
-    model = spec.copy().compile()
-    for mesh in [m for m in spec.meshes if m.name in names]:
-        vertices, faces = _merged(*_read(model, model.mesh(mesh.name).id), size)
-        if len(faces) >= _FEWEST:
-            mesh.file = ""
-            mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
-            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX  # it need not be closed
-
-
-def _read(
-    model: mujoco.MjModel, mesh: int
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
-    """Return a mesh as its file has it, m: compiled, it lies about its centre of mass."""
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    vertices = model.mesh_vert[first : first + count].astype(float)
-    first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-    R = np.empty(9)
-    mujoco.mju_quat2Mat(R, model.mesh_quat[mesh])
-    faces = model.mesh_face[first : first + count]
-    return vertices @ R.reshape(3, 3).T + model.mesh_pos[mesh], faces
-
-
-def _merged(
-    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], size: float
-) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, "l 3"]]:
-    cubes, cube = np.unique(np.floor(vertices / size), axis=0, return_inverse=True)
-    means = np.zeros_like(cubes)
-    np.add.at(means, cube.ravel(), vertices)
-    means /= np.bincount(cube.ravel())[:, None]
-    corners = cube.ravel()[faces]
-    ordered = np.sort(corners, axis=1)
-    _, first = np.unique(ordered, axis=0, return_index=True)
-    kept = first[(np.diff(ordered[first], axis=1) > 0).all(1)]  # neither twice nor without an area
-    used, corner = np.unique(corners[kept], return_inverse=True)
-    return means[used], corner.reshape(-1, 3).astype(np.int32)
