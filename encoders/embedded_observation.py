@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float32
 
 from touchgoal.control.features import TACTILE
+from touchgoal.control.tactile.background import Background
+from touchgoal.control.tactile.contact import THRESHOLD, ContactDetector
 from touchgoal.encoders.backbones.frame_history import RecentFrames
 from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.runtime.errors import UserError
@@ -21,7 +23,8 @@ Observation = dict[str, Any]
 class EmbeddedTouch(gym.ObservationWrapper[Observation, np.ndarray, Observation]):
     """Replaces the tactile images by `observation.touch`: the left embedding, then the right one.
 
-    An episode's first images, which are untouched, are the background.
+    An episode's first images, which are untouched, are the background. While a fingertip touches nothing its
+    embedding is that of the first image, so that most ticks cost no network.
     """
 
     def __init__(self, env: gym.Env, encoder: AnyTouchEncoder) -> None:
@@ -35,6 +38,9 @@ class EmbeddedTouch(gym.ObservationWrapper[Observation, np.ndarray, Observation]
         self._recent = {k: RecentFrames(encoder.preprocess, encoder.offsets) for k in TACTILE}
         self._ticks: deque[Observation] = deque(maxlen=1 + max(encoder.offsets))
         self._untouched: Observation = {}
+        self._contact: dict[str, ContactDetector] = {}
+        self._quiet: dict[str, int] = {}  # ticks since each fingertip touched something
+        self._rest: dict[str, Float32[np.ndarray, " e"]] = {}  # their embeddings then
         width = len(TACTILE) * encoder.config.embedding_dim
         kept = {key: space for key, space in spaces.items() if key not in TACTILE}
         touch = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
@@ -51,14 +57,25 @@ class EmbeddedTouch(gym.ObservationWrapper[Observation, np.ndarray, Observation]
         """Return an observation with its touch embedded."""
         if not self._ticks:
             self._untouched = {key: observation[key] for key in TACTILE}
+            self._contact = {
+                key: ContactDetector(Background(observation[key][None]), THRESHOLD)
+                for key in TACTILE
+            }
+            self._quiet, self._rest = dict.fromkeys(TACTILE, 0), {}
         self._ticks.append(observation)
+        for key, contact in self._contact.items():
+            self._quiet[key] = 0 if contact.update(observation[key]) else self._quiet[key] + 1
+        seen = [k for k in TACTILE if not self._rest or self._quiet[k] < len(self._ticks)]
+        embedded = {**self._rest, **(self._embed(seen) if seen else {})}
+        self._rest = self._rest or embedded
         kept = {key: value for key, value in observation.items() if key not in TACTILE}
-        return kept | {TOUCH: self._embed()}
+        return kept | {TOUCH: np.concatenate([embedded[key] for key in TACTILE])}
 
     @torch.no_grad()
-    def _embed(self) -> Float32[np.ndarray, " e"]:
+    def _embed(self, keys: list[str]) -> dict[str, Float32[np.ndarray, " e"]]:
         frames = [
             self._recent[key].latest([tick[key] for tick in self._ticks], self._untouched[key])
-            for key in TACTILE
+            for key in keys
         ]
-        return self._encoder.embed_touch(self._encoder.stack(torch.cat(frames))).numpy().ravel()
+        found = self._encoder.embed_touch(self._encoder.stack(torch.cat(frames))).numpy()
+        return dict(zip(keys, found, strict=True))

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from in_process import run_benchmark
@@ -12,6 +13,8 @@ from stable_baselines3.common.env_checker import check_env
 import touchgoal
 from benchmarks.papers import shaping
 from touchgoal.control import features as ft
+from touchgoal.encoders.embedded_observation import TOUCH, EmbeddedTouch
+from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.for_rl import TACTILE_SIZE
 
@@ -51,6 +54,19 @@ def test_the_cost_to_a_goal_as_reward() -> None:
         _, paid, *_, after = env.step(np.zeros(8, np.float32))
         assert paid == pytest.approx(info["cost"] - after["cost"]), "gamma is 1"
         assert info["cost"] < after["cost"], "it begins at the goal"
+
+
+def test_embedded_touch_is_the_encoders_and_rests_while_untouched() -> None:
+    env = EmbeddedTouch(
+        touchgoal.make("pick-place", cameras=(), **SHORT), load_encoder("gelsight_mini")
+    )
+    seen = np.full((7, 240, 320, 3), 90, np.uint8)
+    for frame in seen[2:4]:
+        cv2.circle(frame, (160, 120), 40, (190, 20, 140), -1)
+    ticks = [env.observation({ft.TACTILE[0]: frame, ft.TACTILE[1]: seen[0]}) for frame in seen]
+    left, right = np.split(np.stack([tick[TOUCH] for tick in ticks]), 2, axis=1)
+    np.testing.assert_allclose(left, env._encoder.embed_frames(seen, seen[0]), atol=1e-4)
+    assert (right == right[0]).all() and not np.allclose(left[2], left[0], atol=0.01)
 
 
 @pytest.mark.slow

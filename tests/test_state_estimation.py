@@ -144,7 +144,9 @@ def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
     tcp = placements.tcp[rows]
     for k, said in enumerate(("a red dot", "a blue dot")):
         words = embed([said]).expand(len(tcp), -1)
-        off = sight(images, tcp, placements.shift[rows], words)[:, :2] - placements.start[rows, k, :2]
+        off = (
+            sight(images, tcp, placements.shift[rows], words)[:, :2] - placements.start[rows, k, :2]
+        )
         assert off.norm(dim=1).median() < 0.02  # 0.12 by chance
 
 
