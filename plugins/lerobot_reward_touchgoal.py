@@ -35,6 +35,17 @@ from touchgoal.rewards.reward import Reward
 
 __all__ = ["TouchgoalConfig", "TouchgoalRewardModel", "make_touchgoal_pre_post_processors"]
 _FILES = "judge.json", "goal.npz", "normalizer.json", "value.json", "value.safetensors"
+_CARD = """---
+library_name: lerobot
+pipeline_tag: robotics
+license: {license}
+tags: [robotics, lerobot, reward-model, touchgoal, tactile]
+---
+
+A reward that sees and feels: the distance of a run from where successes end, in both cameras, both fingertips and
+the forces, by [touchgoal](https://pypi.org/project/touchgoal). `pip install ./plugins` in a clone of it, then
+`--reward_model.type=touchgoal --reward_model.pretrained_path=THIS`.
+"""
 PROGRESS, COLUMN = "touchgoal_progress.parquet", "progress_sparse"
 
 
@@ -51,6 +62,8 @@ class TouchgoalConfig(RewardModelConfig):
     """Scene that the judge was fitted on; "real" for episodes of one's own."""
     task: str = ""
     """Task in words, as in the episodes that the judge was fitted on."""
+    object: str = ""
+    """Object of the runs, which chooses among the goals; "" if unknown."""
     fps: float = CONTROL_HZ
     """Frames per second of what is measured."""
     device: str | None = "cpu"
@@ -91,7 +104,8 @@ class TouchgoalRewardModel(PreTrainedRewardModel):
         if any(value.ndim == 4 for value in rows[0].values()):
             return torch.tensor([self.progress(row)[-1] for row in rows])
         reward = self._prepare(rows[0])
-        self._runs += [CostMeter(reward, rate=self.config.fps) for _ in rows[len(self._runs) :]]
+        about = self.config.object, self.config.fps
+        self._runs += [CostMeter(reward, *about) for _ in rows[len(self._runs) :]]
         found = []
         for run, tick in zip(self._runs, rows, strict=True):
             run.add(tick)
@@ -103,9 +117,9 @@ class TouchgoalRewardModel(PreTrainedRewardModel):
     def progress(self, frames: dict[str, np.ndarray]) -> np.ndarray:
         """Return the progress (t,) along a run, whose frames are as touchgoal records them."""
         reward = self._prepare(frames)
-        embedded = reward.embedder.embed_episode(
-            Episode(frames, self.config.task), self.config.fps, "a run"
-        )
+        facts = {"object": self.config.object} if self.config.object else {}
+        run = Episode(frames, self.config.task, facts)
+        embedded = reward.embedder.embed_episode(run, self.config.fps, "a run")
         return 1 - reward.curves(embedded).costs[FUSED]
 
     def _prepare(self, frames: dict[str, np.ndarray]) -> PreparedReward:
@@ -122,9 +136,9 @@ class TouchgoalRewardModel(PreTrainedRewardModel):
         for name in _FILES:
             if (self._folder / name).is_file():
                 shutil.copy(self._folder / name, save_directory / name)
-        tags = ["touchgoal", "tactile", *(config.tags or [])]
-        card = self.generate_model_card("unknown", config.type, config.license, tags)
-        card.save(str(save_directory / "README.md"))
+        (save_directory / "README.md").write_text(
+            _CARD.format(license=config.license or "apache-2.0")
+        )
 
     @classmethod
     def from_pretrained(

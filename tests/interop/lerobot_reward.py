@@ -27,7 +27,7 @@ CHUNK = 16
 def main() -> None:
     root, own = Path(sys.argv[1]), 1 - np.load(sys.argv[2])
     dataset = LeRobotDataset("touchgoal/reward", root=root)
-    config = make_reward_model_config("touchgoal", fps=dataset.fps)
+    config = make_reward_model_config("touchgoal", fps=dataset.fps, object="wooden_block")
     model = make_reward_model(config)
     assert get_reward_model_class("touchgoal") is type(model) and not model.is_trainable
     before, _ = make_reward_pre_post_processors(config)
