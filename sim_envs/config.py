@@ -19,8 +19,8 @@ from touchgoal.runtime.option_types import (
     checked_dataclass,
 )
 from touchgoal.sim_envs.cell.deployment import AS_DEPLOYED, IDEAL_DEPLOYMENT, DeploymentConfig
+from touchgoal.sim_envs.scene.lighting import USUAL, Lighting
 from touchgoal.sim_envs.scene.objects import CATALOGUE, find_object
-from touchgoal.sim_envs.scene.surroundings import USUAL, Surroundings
 from touchgoal.sim_envs.scene.wires import (
     PER_FAMILY,
     TRAINED,
@@ -185,8 +185,8 @@ class EnvConfig(SceneConfig):
     light_change: Annotated[LightChange, FIXED] = (0.0,)
     """Change of the fingertips' light after an episode's first image, as a share: one value, or
     red, green and blue. -0.15 dims them by 15 %."""
-    surroundings: Annotated[Surroundings, FIXED] = USUAL
-    """Changes of the front camera and of the light in the room."""
+    lighting: Annotated[Lighting, FIXED] = USUAL
+    """Changes of the light in the room."""
     as_deployed: bool = False
     """Simulate the delays, limits and measurement errors of an arm driven by `deploy`."""
     deployment: DeploymentConfig = DeploymentConfig()

@@ -15,7 +15,7 @@ from touchgoal.policies.perception.usual_view import UsualView
 from touchgoal.runtime.errors import RefusedError, UserError
 from touchgoal.sim_envs.config import USUAL_CAMERA, CameraPlacement, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.scene.surroundings import USUAL, Surroundings
+from touchgoal.sim_envs.scene.variety import moved_camera
 
 TASK = PickPlaceConfig(
     objects=("wooden_block",), tactile=False, cameras=("front",), camera_size=(256, 256)
@@ -23,15 +23,11 @@ TASK = PickPlaceConfig(
 
 
 def placed(shift: tuple[float, float, float], roll: float, fovy: float) -> CameraPlacement:
-    usual = Rotation.from_quat(USUAL_CAMERA[3:7], scalar_first=True)
-    turned = (usual * Rotation.from_euler("z", roll, degrees=True)).as_quat(scalar_first=True)
-    return (*np.add(USUAL_CAMERA[:3], shift), *turned, fovy)  # pyright: ignore[reportReturnType]
+    return moved_camera(USUAL_CAMERA, np.add(USUAL_CAMERA[:3], shift), (roll, 0, 0), fovy)
 
 
-def first_look(
-    camera: CameraPlacement | None, surroundings: Surroundings = USUAL
-) -> tuple[PickPlace, dict[str, np.ndarray]]:
-    env = PickPlace(replace(TASK, front_camera=camera, surroundings=surroundings))
+def first_look(camera: CameraPlacement | None) -> tuple[PickPlace, dict[str, np.ndarray]]:
+    env = PickPlace(replace(TASK, front_camera=camera))
     observation, _ = env.reset(seed=8)
     return env, {**observation, **dict.fromkeys(ft.TACTILE, np.zeros((8, 8, 3), np.uint8))}
 
@@ -86,16 +82,14 @@ def test_benchmark_first_look(capsys: pytest.CaptureFixture) -> None:
 
 def test_a_camera_that_is_not_where_it_was_calibrated_is_told() -> None:
     network = load_pose_estimator(SHIPPED_POLICIES["pick-place"] / ESTIMATOR)
-    _, first = first_look(None, Surroundings(camera_turn=(0.0, 6.0)))
+    _, first = first_look(moved_camera(USUAL_CAMERA, np.array(USUAL_CAMERA[:3]), (0, 6, 0), 40))
     with pytest.raises(RefusedError, match="mm from where the calibrated camera sees them"):
         StateEstimator(network, "", USUAL_CAMERA).estimate(first, first)
     aside = placed((0, 0.1, 0), 0, 40)
     view, image = UsualView(USUAL_CAMERA, aside, (256, 256)), first[ft.FRONT]
     shown = [view.shows(np.array([150.0, column]), image) for column in (6.0, 128.0, 250.0)]
     assert shown == [False, True, True]
-    shifted = PickPlace(
-        replace(TASK, surroundings=Surroundings(camera_shift=(0.0, 0.02, 0.0)), as_deployed=True)
-    )
+    shifted = PickPlace(replace(TASK, front_camera=placed((0, 0.02, 0), 0, 40), as_deployed=True))
     shifted.reset(seed=3)
     off = np.subtract(shifted.calibrated_camera()[:3], USUAL_CAMERA[:3])
     shifted.reset(seed=3)

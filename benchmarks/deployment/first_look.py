@@ -13,7 +13,6 @@ from typing import Any
 import cv2
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control import features as ft
@@ -31,7 +30,8 @@ from touchgoal.sim_envs.config import (
     SceneConfig,
 )
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.scene.surroundings import Surroundings
+from touchgoal.sim_envs.scene.lighting import Lighting
+from touchgoal.sim_envs.scene.variety import moved_camera
 
 _RIGHT = 20.0  # mm
 _NOISE = 12.0  # grey levels
@@ -65,15 +65,14 @@ class _Change:
     nothing: bool = False  # whether nothing can be right, so that only a refusal is
 
 
-def _camera(
+def changed_camera(
     shift: tuple[float, float, float] = (0, 0, 0),
     turn: tuple[float, float, float] = (0, 0, 0),
     fovy: float = USUAL_CAMERA[-1],
 ) -> dict[str, Any]:
     """Return the option of a camera shifted (m) and turned (roll, pitch, yaw, degrees) from the usual one."""
-    usual = Rotation.from_quat(USUAL_CAMERA[3:7], scalar_first=True)
-    quat = (usual * Rotation.from_euler("zxy", turn, degrees=True)).as_quat(scalar_first=True)
-    return {"front_camera": (*np.add(USUAL_CAMERA[:3], shift), *quat, fovy)}
+    place = np.add(USUAL_CAMERA[:3], shift)
+    return {"front_camera": moved_camera(USUAL_CAMERA, place, turn, fovy)}
 
 
 def _painted(name: str, *rgb: float) -> Callable[[Spec], None]:
@@ -117,16 +116,16 @@ def _half_covered(image: np.ndarray) -> np.ndarray:
 
 CHANGES = {
     "unchanged": _Change({}),
-    "camera rolled 5 degrees": _Change(_camera(turn=(5, 0, 0))),
-    "camera rolled 30 degrees": _Change(_camera(turn=(30, 0, 0))),
-    "camera pitched 5 degrees up": _Change(_camera(turn=(0, 5, 0))),
-    "camera 8 cm aside": _Change(_camera((0.0, 0.08, 0.0))),
-    "camera 20 cm back": _Change(_camera((0.17, 0.0, 0.1))),
-    "camera 15 cm higher": _Change(_camera((0.0, 0.0, 0.15), (0, -9, 0))),
-    "lens of 36 degrees": _Change(_camera(fovy=36.0)),
-    "lens of 60 degrees": _Change(_camera(fovy=60.0)),
-    "lamp 1 m off": _Change({"surroundings": Surroundings(lamp_shift=(-1.0, 0.0, 0.0))}),
-    "room twice as bright": _Change({"surroundings": Surroundings(room_light=1.0)}),
+    "camera rolled 5 degrees": _Change(changed_camera(turn=(5, 0, 0))),
+    "camera rolled 30 degrees": _Change(changed_camera(turn=(30, 0, 0))),
+    "camera pitched 5 degrees up": _Change(changed_camera(turn=(0, 5, 0))),
+    "camera 8 cm aside": _Change(changed_camera((0.0, 0.08, 0.0))),
+    "camera 20 cm back": _Change(changed_camera((0.17, 0.0, 0.1))),
+    "camera 15 cm higher": _Change(changed_camera((0.0, 0.0, 0.15), (0, -9, 0))),
+    "lens of 36 degrees": _Change(changed_camera(fovy=36.0)),
+    "lens of 60 degrees": _Change(changed_camera(fovy=60.0)),
+    "lamp 1 m off": _Change({"lighting": Lighting(lamp_shift=(-1.0, 0.0, 0.0))}),
+    "room twice as bright": _Change({"lighting": Lighting(room_light=1.0)}),
     "brown table": _Change({}, _painted("table", 0.45, 0.3, 0.2)),
     "blue table": _Change({}, _painted("table", 0.2, 0.3, 0.6)),
     "white table": _Change({}, _painted("table", 0.95, 0.95, 0.95)),

@@ -7,13 +7,14 @@ it: `--policy expert`, `--policy follower`.
 from dataclasses import replace
 from typing import Any
 
+from benchmarks.deployment.first_look import changed_camera
 from benchmarks.deployment.trials import UNCHANGED, DeployedOptions, try_cases
 from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.sim_envs.config import TaskConfig
+from touchgoal.sim_envs.scene.lighting import Lighting
 from touchgoal.sim_envs.scene.objects import NEW_KINDS
-from touchgoal.sim_envs.scene.surroundings import Surroundings
 from touchgoal.sim_envs.scene.wires import HELD_OUT
 
 _LIGHT = {
@@ -37,11 +38,11 @@ _CHANGES: dict[SimulatedTask, dict[str, dict[str, Any]]] = {
         "object moved 2 cm after a second": {"nudge": 0.02},
         "object taken away": {"interference": "taken", "max_seconds": 24.0},
         "object knocked out of the hand": {"interference": "knocked", "max_seconds": 24.0},
-        "camera turned 5 degrees up": {"surroundings": Surroundings(camera_turn=(0.0, 5.0))},
-        "camera turned 5 degrees aside": {"surroundings": Surroundings(camera_turn=(5.0, 0.0))},
-        "camera moved 2 cm aside": {"surroundings": Surroundings(camera_shift=(0.0, 0.02, 0.0))},
-        "lamp moved 40 cm": {"surroundings": Surroundings(lamp_shift=(-0.4, 0.0, 0.0))},
-        "room light -80%": {"surroundings": Surroundings(room_light=-0.8)},
+        "camera turned 5 degrees up": changed_camera(turn=(0, 5, 0)),
+        "camera turned 5 degrees aside": changed_camera(turn=(0, 0, 5)),
+        "camera moved 2 cm aside": changed_camera((0, 0.02, 0)),
+        "lamp moved 40 cm": {"lighting": Lighting(lamp_shift=(-0.4, 0.0, 0.0))},
+        "room light -80%": {"lighting": Lighting(room_light=-0.8)},
     },
     "bead-maze": {
         **_LIGHT,

@@ -18,10 +18,11 @@ from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import USUAL_CAMERA, PickPlaceConfig, SceneConfig
 from touchgoal.sim_envs.pick_place import WORKSPACE, Hand, PickPlace
-from touchgoal.sim_envs.scene.surroundings import USUAL, UsualScene, draw_surroundings
+from touchgoal.sim_envs.scene.lighting import USUAL, UsualLight, draw_lighting
 from touchgoal.sim_envs.scene.variety import (
     CALIBRATION_ERROR,
     cover_table,
+    draw_near_placement,
     draw_placement,
     measured_placement,
     paint,
@@ -42,8 +43,8 @@ class Variety:
     covered: float = 0.4  # scenes whose table has a pattern
     repainted: float = 0.5  # placements with table and disc of any colour, and a disc of any size
     elsewhere: float = 0.4  # placements seen by a calibrated camera that stands elsewhere
-    surroundings: float = (
-        0.7  # other placements with another camera pose, and all with another light
+    changed: float = (
+        0.7  # others with a camera turned and moved a little, and all with another light
     )
     hand_anywhere: float = 0.2  # placements with the hand anywhere over the table
     hand_over: float = 0.3  # placements with it over an object, as when an episode looks again
@@ -129,16 +130,16 @@ def _render_scene(
     env = (_CoveredTable if covered else PickPlace)(config)
     env.reset(seed=seed)
     rng = env.np_random.spawn(1)[0]
-    scene, rows = UsualScene.of(env.model), []
+    light, rows = UsualLight.of(env.model), []
+    camera = config.front_camera or USUAL_CAMERA
     looks = [env.model.geom("table").rgba, env.model.geom("goal").rgba, env.model.geom("goal").size]
     usual = [look.copy() for look in looks]
     for _ in range(placements_each):
         elsewhere = rng.random() < variety.elsewhere
-        changed = elsewhere or rng.random() < variety.surroundings
-        scene.change(env.model, draw_surroundings(rng) if changed else USUAL)
-        if elsewhere:
-            camera = draw_placement(config.front_camera or USUAL_CAMERA, WORKSPACE, rng)
-            place_camera(env.model, camera)
+        changed = elsewhere or rng.random() < variety.changed
+        light.change(env.model, draw_lighting(rng) if changed else USUAL)
+        near = draw_near_placement(camera, rng) if changed else camera
+        place_camera(env.model, draw_placement(camera, WORKSPACE, rng) if elsewhere else near)
         for look, before in zip(looks, usual, strict=True):
             look[:] = before
         if rng.random() < variety.repainted:

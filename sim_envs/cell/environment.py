@@ -26,7 +26,6 @@ from touchgoal.sim_envs.config import (
 )
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, PadContact
 from touchgoal.sim_envs.scene.rendering import open_renderer
-from touchgoal.sim_envs.scene.surroundings import USUAL
 from touchgoal.sim_envs.scene.variety import CALIBRATION_ERROR, measured_placement
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 
@@ -326,13 +325,11 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         As deployed, one that is not where it usually is is 5 mm and 1 degree (RMS) from there, alike
         for the same seed, as after a calibration.
         """
-        config = self.config
-        turned = config.surroundings.camera_turn, config.surroundings.camera_shift
-        if config.front_camera is None and turned == (USUAL.camera_turn, USUAL.camera_shift):
+        if self.config.front_camera is None:
             return USUAL_CAMERA
         drawn: Any = self.np_random.bit_generator.seed_seq  # of the last seed given to reset
         rng = np.random.default_rng(drawn.entropy)
-        off = CALIBRATION_ERROR if config.as_deployed else (0.0, 0.0)
+        off = CALIBRATION_ERROR if self.config.as_deployed else (0.0, 0.0)
         return measured_placement(self.model, self.data, off, rng)
 
     @property

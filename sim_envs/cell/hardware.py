@@ -14,9 +14,9 @@ from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.sim_envs.config import EnvConfig, SceneConfig
 from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
 from touchgoal.sim_envs.scene.contacts import ContactReader, PadContact
+from touchgoal.sim_envs.scene.lighting import UsualLight
 from touchgoal.sim_envs.scene.objects import Body
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
-from touchgoal.sim_envs.scene.surroundings import UsualScene
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
@@ -198,7 +198,7 @@ class SimulatedHardware(ABC):
         self._close_view()
         self._noise_rng = rng
         self.model = model = self.scene(self.config).compile()
-        UsualScene.of(model).change(model, self.config.surroundings)
+        UsualLight.of(model).change(model, self.config.lighting)
         self.data = mujoco.MjData(model)
         joints = [model.joint(name) for name in arm_joints(self.config.arm)]
         self.arm_positions = np.array([joint.qposadr[0] for joint in joints])

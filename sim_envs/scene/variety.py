@@ -16,6 +16,7 @@ _DISC = 0.018, 0.05  # m, radius
 _CONTRAST = 0.25  # of colours in [0, 1], between disc and table
 _PATTERN, _REPEATED = 128, (1, 6)  # px of a pattern's side; times that it repeats along the table
 _SHIFT, _TURN, _ROLL = 0.2, 10.0, 35.0  # m and degrees, of the front camera, at most
+_NEAR = 0.03, 7.0  # m and degrees, of one that is taken to stand where it usually does
 _LENS = 34.0, 64.0  # degrees, vertical field of view
 _MARGIN = 0.05  # of the image, beside the table's corners that a camera must see
 
@@ -73,22 +74,40 @@ def paint(model: Any, rng: np.random.Generator) -> None:
     model.geom("goal").size[0] = rng.uniform(*_DISC)
 
 
+def draw_near_placement(usual: CameraPlacement, rng: np.random.Generator) -> CameraPlacement:
+    """Draw a camera 3 cm and 7 degrees (pitch, yaw) from another one, along each axis at most."""
+    place = np.add(usual[:3], rng.uniform(-_NEAR[0], _NEAR[0], 3))
+    return moved_camera(usual, place, (0.0, *rng.uniform(-_NEAR[1], _NEAR[1], 2)), usual[7])
+
+
+def moved_camera(
+    usual: CameraPlacement,
+    place: Float[np.ndarray, "3"],
+    turn: tuple[float, float, float],
+    fovy: float,
+) -> CameraPlacement:
+    """Return a camera at a place (m), turned from the usual one by roll, pitch and yaw (degrees)."""
+    facing = Rotation.from_quat(usual[3:7], scalar_first=True)
+    turned = facing * Rotation.from_euler("zxy", turn, degrees=True)
+    x, y, z = place.tolist()
+    return (x, y, z, *turned.as_quat(scalar_first=True).tolist(), float(fovy))
+
+
 def draw_placement(
     usual: CameraPlacement, table: tuple[tuple[float, float], ...], rng: np.random.Generator
 ) -> CameraPlacement:
     """Draw a camera that sees a part of the table, x and y from and to (m), from elsewhere."""
     corners = np.array([[x, y, z] for x in table[0] for y in table[1] for z in (0.0, 0.1)])
-    facing = Rotation.from_quat(usual[3:7], scalar_first=True)
     while True:
         share = rng.uniform()  # so that small changes are among them
-        place = usual[:3] + share * rng.uniform(-_SHIFT, _SHIFT, 3)
+        place = np.add(usual[:3], share * rng.uniform(-_SHIFT, _SHIFT, 3))
         roll, pitch, yaw = share * rng.uniform(-1, 1, 3) * (_ROLL, _TURN, _TURN)
-        turned = facing * Rotation.from_euler("zxy", (roll, pitch, yaw), degrees=True)
         fovy = usual[7] + share * (rng.uniform(*_LENS) - usual[7])
-        x, y, z = turned.inv().apply(corners - place).T
-        if np.all(np.abs([x, y]) / z < (1 - _MARGIN) * np.tan(np.radians(fovy / 2))):
-            quat = turned.as_quat(scalar_first=True)
-            return (*place.tolist(), *quat.tolist(), float(fovy))  # pyright: ignore[reportReturnType]
+        camera = moved_camera(usual, place, (roll, pitch, yaw), fovy)
+        seen = Rotation.from_quat(camera[3:7], scalar_first=True).inv().apply(corners - place)
+        edge = (1 - _MARGIN) * np.tan(np.radians(fovy / 2))
+        if np.all(np.abs(seen[:, :2]) < edge * seen[:, 2:]):
+            return camera
 
 
 def place_camera(model: Any, placement: CameraPlacement) -> None:

@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.deployment.first_look import changed_camera
 from touchgoal.control.features import FRONT
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.scene.surroundings import Surroundings
+from touchgoal.sim_envs.scene.lighting import Lighting
 
 SIZE = 256
 
@@ -27,22 +28,22 @@ def test_a_camera_turns_and_moves_as_said() -> None:
     """Turned to its right, the scene moves left by focal length times tangent; up, it moves down."""
     focal = SIZE / 2 / np.tan(np.radians(20))  # px, of 40 degrees
     _, usual = imaged()
-    _, right = imaged(surroundings=Surroundings(camera_turn=(5.0, 0.0)))
-    _, up = imaged(surroundings=Surroundings(camera_turn=(0.0, 5.0)))
+    _, right = imaged(**changed_camera(turn=(0, 0, 5)))
+    _, up = imaged(**changed_camera(turn=(0, 5, 0)))
     expected = focal * np.tan(np.radians(5))
     assert right - usual == pytest.approx([-expected, 0], abs=2)
     assert up - usual == pytest.approx([0, expected], abs=2)
     # It looks from the front, so that y to the left of the arm is right in its image.
-    _, aside = imaged(surroundings=Surroundings(camera_shift=(0.0, 0.02, 0.0)))
+    _, aside = imaged(**changed_camera((0, 0.02, 0)))
     distance = np.linalg.norm([1.15 - 0.46, 0.55])  # m, about that of the goal
     assert aside - usual == pytest.approx([-focal * 0.02 / distance, 0], abs=1)
 
 
 def test_the_room_dims_and_the_lamp_moves() -> None:
     usual, _ = imaged()
-    dim, _ = imaged(surroundings=Surroundings(room_light=-0.8))
+    dim, _ = imaged(lighting=Lighting(room_light=-0.8))
     assert dim.mean() == pytest.approx(0.2 * usual.mean(), rel=0.1)
-    lamp, _ = imaged(surroundings=Surroundings(lamp_shift=(-0.4, 0.0, 0.0)))
+    lamp, _ = imaged(lighting=Lighting(lamp_shift=(-0.4, 0.0, 0.0)))
     assert 1 < np.abs(lamp - usual).mean() < 30
 
 
