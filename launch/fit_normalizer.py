@@ -8,6 +8,7 @@ each part of the cost. It writes normalizer.json, and goal.npz: the successful e
 by which `touchgoal judge` tells success from failure. Any camera works; plain videos work for images.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,8 +24,8 @@ class Config:
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Sets of episodes; or at least two video files or folders of images, each of one success."""
     modalities: tuple[Literal["image", "tactile", "text"], ...] = ()
-    """Modalities to fit: image and tactile by default, as far as the episodes have them; name text, too,
-    for goals that are sentences."""
+    """Modalities to fit: by default image and tactile, as far as they tell an episode's start from its end;
+    name text, too, for goals that are sentences."""
     value: bool = False
     """Also fit a value of the task: a network that reads progress from images, whatever the goal. It
     needs at least 4 successes and a minute or two, and holds for these cameras and towers."""
@@ -56,7 +57,7 @@ def main(config: Config) -> None:
     from collections import Counter
 
     from touchgoal.episodes.keys import parse_keys
-    from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
+    from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, separating
     from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
@@ -89,8 +90,11 @@ def main(config: Config) -> None:
         embedder.describe(embed_trajectory(embedder, t), t.meta)
         for t in track(trajectories, "embedding", "trajectory")
     ]
-    own: list[Modality] = [m for m in embedded[0].modalities if m != "text"]
-    modalities = config.modalities or own
+    modalities: Sequence[Modality] = config.modalities
+    if not modalities:
+        modalities, left_out = separating(embedded)
+        for why in left_out:
+            print(f"left out: {why.partition(';')[0]}")
     normalizer = fit_normalizer(embedded, modalities, inputs.scene)
     value = fit_value(embedded, inputs.fitted_task) if config.value else None
     ends = SuccessfulEnds.of(embedded)

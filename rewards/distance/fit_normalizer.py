@@ -30,6 +30,26 @@ MIN_GAP = 1e-4
 """Least raw distance between the start and the goal median; float32 resolves about 1e-6."""
 
 
+def separating(episodes: Sequence[EmbeddedEpisode]) -> tuple[list[Modality], list[str]]:
+    """Return which of image and touch separate start from end, and why the others do not.
+
+    Touch does not where the hand has let go at the end. UserError: as for `fit_normalizer`, or none does.
+    """
+    found: list[Modality] = []
+    errors = []
+    for modality in episodes[0].modalities:
+        if modality == "text":
+            continue
+        try:
+            fit_normalizer(episodes, [modality], "")
+            found.append(modality)
+        except UserError as error:
+            errors.append(str(error))
+    if not found:
+        raise UserError(errors[0])
+    return found, errors
+
+
 def fit_normalizer(
     episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality], scene: str
 ) -> DistanceNormalizer:
