@@ -66,8 +66,7 @@ def main(config: Config) -> None:
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.control.deployment.session import metrics, report
     from touchgoal.control.deployment.terminal import say
-    from touchgoal.launch.support.cell_run import check_cell, connect
-    from touchgoal.launch.support.confirm import confirm
+    from touchgoal.launch.support.cell_run import check_cell, confirm, connect
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.run_folder import open_run
 
