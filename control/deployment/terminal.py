@@ -17,6 +17,7 @@ import numpy as np
 from touchgoal.control.deployment.control_loop import Request, TickStatus
 from touchgoal.control.safety.action_filter import Mode
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.interruption import handling
 
 _CTRL_C = "\x03"
 
@@ -157,13 +158,10 @@ class Terminal:
     @contextmanager
     def watching(self) -> Iterator[None]:
         """Take keys and signals as requests while this lasts."""
-        before = {number: signal.signal(number, self._on_signal) for number in _SIGNALS}
         try:
-            with self._keyboard or nullcontext():
+            with handling(_SIGNALS, self._on_signal), self._keyboard or nullcontext():
                 yield
         finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
             if self._shows:
                 print()
 
