@@ -25,8 +25,7 @@ from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, ro
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.teleoperation.config import TeleoperationConfig
-from touchgoal.control.teleoperation.device import HandMotion, TeleoperationDevice
-from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
+from touchgoal.control.teleoperation.device import HandMotion, KeyboardDevice, TeleoperationDevice
 from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
 from touchgoal.control.teleoperation.teleoperator import Teleoperator, YieldingHand

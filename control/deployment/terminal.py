@@ -1,6 +1,5 @@
 """The operator's terminal during a deployment: keys, signals, and one status line."""
 
-import contextlib
 import os
 import select
 import signal
@@ -9,7 +8,7 @@ import termios
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, TextIO
 
 import numpy as np
@@ -44,7 +43,7 @@ class Keyboard:
 
     def __exit__(self, *_: object) -> None:
         """Restore the terminal and drop unread keys, so that the shell does not get them."""
-        with contextlib.suppress(termios.error):  # it has gone
+        with suppress(termios.error):  # it has gone
             termios.tcsetattr(self._terminal, termios.TCSAFLUSH, self._before)
 
     def read_keys(self) -> str:
