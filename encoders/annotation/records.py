@@ -3,7 +3,6 @@
 Of such lines touches to align are made: an object for each caption of a touched instance.
 """
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
@@ -22,6 +21,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.image_file import read_image
 from touchgoal.runtime.option_types import STRICT, first_problem
 from touchgoal.runtime.progress import track
+
+_VIEW = 224  # px, of a view of a touched object
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -111,9 +112,8 @@ class LinesFile(Generic[Line]):
 
     def append(self, line: Line) -> None:
         """Write one more line, complete or not at all."""
-        text = json.dumps(self._lines.dump_python(line, mode="json"), ensure_ascii=False)
         with self.path.open("ab") as file:
-            file.write(text.encode() + b"\n")
+            file.write(self._lines.dump_json(line) + b"\n")
 
 
 def read_annotations(path: Path) -> list[AnnotatedTouch]:
@@ -125,9 +125,6 @@ def read_annotations(path: Path) -> list[AnnotatedTouch]:
     if not records:
         raise UserError(f"{path} holds no annotated touch: give an annotations.jsonl of annotate")
     return records
-
-
-_VIEW = 224  # px
 
 
 def annotated_touches(records: Sequence[AnnotatedTouch], sensor: str) -> Touches:

@@ -7,13 +7,13 @@ failures, which must be made on purpose, success is told only up to the stricter
 successes exceed; how many failures pass is then unknown.
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from touchgoal.encoders.pretrained import DEFAULT_ENCODER
 from touchgoal.episodes.outcomes.judged import Verdict
@@ -22,8 +22,8 @@ from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.judging.end_state import end_cost, end_costs
 from touchgoal.rewards.value import Value, fit_value
-from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.json_file import write_json
 
 FIT_JUDGE = "fit one with touchgoal fit-normalizer --judge"
 SHIPPED_JUDGE = DEFAULT_ENCODER.name
@@ -117,19 +117,14 @@ class Judge:
 
     def save(self, path: Path) -> None:
         """Write JSON, atomically."""
-        write_file(path, (json.dumps(asdict(self), indent=2) + "\n").encode())
+        write_json(path, self)
 
     @classmethod
     def load(cls, path: Path) -> "Judge":
         """Read what `save` wrote; UserError: no such file, or another one."""
         try:
-            content = json.loads(path.read_text())
-            if content.keys() != {field.name for field in fields(cls)}:
-                raise ValueError
-            return cls(
-                tuple(map(float, content["successes"])), tuple(map(float, content["failures"]))
-            )
-        except (OSError, ValueError, TypeError, AttributeError):
+            return TypeAdapter(cls).validate_json(path.read_bytes())
+        except (OSError, ValueError):
             raise UserError(f"{path} is no judge: {FIT_JUDGE}") from None
 
 
