@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from touchgoal.encoders.towers.wheels import wheel_folder
+from touchgoal.runtime.errors import wheel_folder
 
 
 class CompiledNetwork:

@@ -38,7 +38,7 @@ def main(config: Config) -> None:
     from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
     from touchgoal.control.deployment.manual import without_images
     from touchgoal.control.deployment.preflight import check_client
-    from touchgoal.launch.support.confirm import confirm
+    from touchgoal.launch.support.cell_run import confirm
 
     cell = without_images(read_cell_file(find_cell_file(config.cell)))
     if cell.arm == "sim":

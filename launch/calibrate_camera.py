@@ -71,8 +71,7 @@ def _calibrate(config: Config, path: Path, board: "Board") -> None:
     from touchgoal.control.cell.cell_file import read_cell_file
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.control.hand_eye.solve import calibrate_camera
-    from touchgoal.launch.support.cell_run import connect
-    from touchgoal.launch.support.confirm import confirm
+    from touchgoal.launch.support.cell_run import confirm, connect
     from touchgoal.runtime.run_folder import open_run
 
     cell = read_cell_file(path)
@@ -161,7 +160,7 @@ def _save_views(views: "list[View]", out: Path) -> None:
 def _report(result: "HandEye", config: Config, cell_file: Path, out: Path, rows: int) -> None:
     import numpy as np
 
-    from touchgoal.control.cell.camera_pose import camera_lines, write_camera
+    from touchgoal.control.cell.cell_file import camera_lines, write_camera
     from touchgoal.control.deployment.observation import quaternion
 
     mm, degrees = 1e3 * result.position_errors, np.degrees(result.rotation_errors)

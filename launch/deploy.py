@@ -151,8 +151,7 @@ def _deploy(
     from touchgoal.control.deployment.terminal import HELP, Terminal
     from touchgoal.control.features import CONTROL_HZ
     from touchgoal.episodes.episode_recorder import EpisodeRecorder
-    from touchgoal.launch.support.cell_run import check_cell
-    from touchgoal.launch.support.confirm import confirm
+    from touchgoal.launch.support.cell_run import check_cell, confirm
 
     def request() -> Request:
         return terminal.operator_request() or ("failed" if cost and cost.failed else "")

@@ -62,8 +62,7 @@ def main(config: Config) -> None:
     from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
     from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
     from touchgoal.rewards.goals import Modality
-    from touchgoal.rewards.judging.fit_judge import fit_judge
-    from touchgoal.rewards.judging.judge import JUDGE, LEAST_SUCCESSES
+    from touchgoal.rewards.judging.judge import JUDGE, LEAST_SUCCESSES, fit_judge
     from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.open_source import open_successes
     from touchgoal.rewards.value import fit_value

@@ -5,24 +5,14 @@ A page shows the ends, doubtful ones first. With --correct a person decides; tha
 then on, and the judge learns from it.
 """
 
-import csv
 import sys
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
-from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import RARE, checked_dataclass
-
-if TYPE_CHECKING:
-    from touchgoal.episodes.outcomes.judged import JudgedOutcome
-    from touchgoal.rewards.judging.judge import Judge, Judgement
-    from touchgoal.rewards.report.judged_page import JudgedEnd
-    from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 
 
 @checked_dataclass
@@ -52,6 +42,7 @@ def main(config: Config) -> None:
     from touchgoal.rewards.features.embedding_cache import embed_end
     from touchgoal.rewards.judging.judge import JUDGE, Judgement, find_judge
     from touchgoal.rewards.measure import write_skipped
+    from touchgoal.rewards.report.judged_page import ask, report
     from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
     from touchgoal.rewards.sources.open_source import open_source
@@ -83,70 +74,12 @@ def main(config: Config) -> None:
     if not said:
         raise UserError(f"nothing could be judged: {skipped[0].reason}")
     print(write_skipped(skipped, len(said) + len(skipped), out))
-    ends = _report(said, told, judge, out)
-    for end, success in _ask(ends) if config.correct else ():
+    ends = report(said, told, judge, out)
+    for end, success in ask(ends) if config.correct else ():
         verdict, i = "success" if success else "failure", end.trajectory.index
         told[i] = JudgedOutcome(verdict, "person", end.said.cost)
         write_judged(episodes, {i: told[i]})
         judge = judge.corrected(end.said.cost, success)
         judge.save(folder / JUDGE)
     if judge is not prepared.judge:
-        _report(said, told, judge, out)
-
-
-def _report(
-    said: "Mapping[EpisodeTrajectory, Judgement]",
-    told: "Mapping[int, JudgedOutcome]",
-    judge: "Judge",
-    out: Path,
-) -> "list[JudgedEnd]":
-    """Write what the judge, as it is now, and persons say; return it, doubtful ones first."""
-    from touchgoal.episodes.outcomes.judged import write_judged
-    from touchgoal.rewards.report.judged_page import JudgedEnd, write_judged_page
-
-    middle = sum(judge.limits) / 2  # the doubtful ones are nearest to it, then those near a limit
-    ends = [
-        JudgedEnd(t, judge.judge(one.parts, one.cost), told.get(t.index))
-        for t, one in sorted(said.items(), key=lambda pair: abs(pair[1].cost - middle))
-    ]
-    write_judged(ends[0].trajectory.episodes, {e.trajectory.index: e.outcome for e in ends})
-    rows = [["episode", "verdict", "by", "recorded", "cost", *ends[0].said.parts, "reasons"]]
-    for end in sorted(ends, key=lambda end: end.trajectory.index):
-        about = [str(end.trajectory.index), end.outcome.verdict, end.outcome.by, end.recorded]
-        costs = [f"{cost:.4f}" for cost in (end.said.cost, *end.said.parts.values())]
-        rows.append([*about, *costs, "; ".join(end.said.reasons)])
-    with atomic_write(out / "judged.csv") as unfinished, unfinished.open("w") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
-    table = f"{judge}\n\n{_table(ends)}"
-    print(f"{table}\npage: {write_judged_page(ends, table, out)}")
-    return ends
-
-
-def _table(ends: "Sequence[JudgedEnd]") -> str:
-    """Return how many episodes have each verdict, how many of these agree, and the worst reasons."""
-    from touchgoal.rewards.report.tables import aligned
-
-    recorded = [name for name in ("success", "failure") if any(e.recorded == name for e in ends)]
-    rows = [["verdict", "episodes", *(f"recorded {name}" for name in recorded)]]
-    for verdict in ("success", "failure", "unsure"):
-        some = [end.recorded for end in ends if end.outcome.verdict == verdict]
-        rows.append([verdict, str(len(some)), *(str(some.count(name)) for name in recorded)])
-    lines = aligned(rows)
-    if sure := [e for e in ends if e.recorded and e.outcome.verdict != "unsure"]:
-        agree = sum(end.recorded == end.outcome.verdict for end in sure)
-        lines.append(f"{agree} of {len(sure)} verdicts agree with the recorded outcome")
-    doubted = [e.said.reasons[0] for e in ends if e.said.reasons and e.said.verdict != "success"]
-    lines += ["what differs most in the others:"] if doubted else []
-    lines += [f"{n:>5}  {reason}" for reason, n in Counter(doubted).most_common()]
-    return "\n".join(lines)
-
-
-def _ask(ends: "Sequence[JudgedEnd]") -> "Iterator[tuple[JudgedEnd, bool]]":
-    """Ask a person about each end that none has told yet; yield the answers, whether it succeeded."""
-    print("s and Enter: success; f: failure; Enter alone: leave it; q: end")
-    for end in ends:
-        answer = "" if end.told else input(f"{end.trajectory.source}  {end.said} > ").strip()
-        if answer == "q":
-            return
-        if answer in ("s", "f"):
-            yield end, answer == "s"
+        report(said, told, judge, out)

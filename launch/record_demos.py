@@ -66,8 +66,7 @@ def main(config: Config) -> None:
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.control.deployment.session import metrics, report
     from touchgoal.control.deployment.terminal import say
-    from touchgoal.launch.support.cell_run import check_cell, connect
-    from touchgoal.launch.support.confirm import confirm
+    from touchgoal.launch.support.cell_run import check_cell, confirm, connect
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.run_folder import open_run
 
@@ -137,7 +136,7 @@ def _record(
 ) -> "Result":
     from touchgoal.control.deployment.session import Session
     from touchgoal.control.deployment.terminal import RECORDING_HELP, Terminal
-    from touchgoal.control.teleoperation.keyboard_device import HELP
+    from touchgoal.control.teleoperation.device import KEYS
     from touchgoal.control.teleoperation.teleoperator import Teleoperator
     from touchgoal.episodes.episode_recorder import EpisodeRecorder
 
@@ -155,7 +154,7 @@ def _record(
             camera_size=_CAMERA_SIZE,
         )
         with terminal.watching():
-            keys = f"\n{HELP}" if config.device == "keyboard" else ""
+            keys = f"\n{KEYS}" if config.device == "keyboard" else ""
             print(f"RECORDING: {RECORDING_HELP}{keys}", flush=True)
             return session.run()
 
@@ -163,7 +162,7 @@ def _record(
 def _open_device(config: Config, connection: "CellConnection", seed: int) -> "TeleoperationDevice":
     """Return the device, at rest; UserError if there is none. `seed` is that of a script's errors."""
     from touchgoal.control.deployment.scripted import PickPlacePoses
-    from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
+    from touchgoal.control.teleoperation.device import KeyboardDevice
     from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
     from touchgoal.control.teleoperation.spacemouse import SpaceMouse
 

@@ -13,7 +13,7 @@ from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
 from touchgoal.control.cell.connection import camera_formats, connect_camera
 from touchgoal.control.deployment.observation import crop_and_resize
 from touchgoal.control.interfaces import Frame
-from touchgoal.control.sensors.usb_cameras import list_cameras
+from touchgoal.control.sensors.fingertip_source import list_cameras
 from touchgoal.runtime.errors import UserError
 
 _TIMEOUT_MS = 10_000.0  # for the next image, as lerobot's own cameras

@@ -1,5 +1,6 @@
 """Exception for a user's mistake, and results of checks with their remedies."""
 
+import importlib.util
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -59,3 +60,11 @@ def install_extra(extra: str) -> str:
     if (root / "pyproject.toml").is_file():
         return f"pip install -e '{root}[{extra}]'"
     return f"in the clone of touchgoal: pip install '.[{extra}]'"
+
+
+def wheel_folder(module: str) -> Path:
+    """Return the folder of a package of the extra `towers`, not imported; UserError if missing."""
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        raise UserError(f"the package {module} is missing: {install_extra('towers')}")
+    return Path(spec.origin).parent

@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
@@ -25,16 +25,26 @@ def on_interruption(message: Callable[[], str]) -> Iterator[None]:
 
 
 @contextmanager
-def terminable() -> Iterator[None]:
-    """Raise `Terminated` in the main thread on SIGTERM during the block."""
+def handling(
+    numbers: Sequence[int], handler: Callable[[int, FrameType | None], object]
+) -> Iterator[None]:
+    """Handle signals in the block; outside the main thread, where that is impossible, do nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, _terminate)
+    before = [signal.signal(number, handler) for number in numbers]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, earlier in zip(numbers, before, strict=True):
+            signal.signal(number, earlier)
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Raise `Terminated` in the main thread on SIGTERM during the block."""
+    with handling([signal.SIGTERM], _terminate):
+        yield
 
 
 @contextmanager
@@ -44,16 +54,8 @@ def stop_on_request() -> Iterator[Callable[[], bool]]:
     Nothing is interrupted half done. Outside the main thread no request comes.
     """
     requests: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    numbers = signal.SIGINT, signal.SIGTERM
-    before = [signal.signal(number, lambda n, _: requests.append(n)) for number in numbers]
-    try:
+    with handling([signal.SIGINT, signal.SIGTERM], lambda number, _: requests.append(number)):
         yield lambda: bool(requests)
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:

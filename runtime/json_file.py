@@ -1,10 +1,10 @@
 """JSON files: keys must be unique, and a file is written whole or not at all."""
 
 import json
-import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from pydantic_core import to_json
 
 from touchgoal.runtime.atomic_write import write_file
 
@@ -19,7 +19,7 @@ def parse_json(data: bytes) -> Any:
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file atomically: numpy scalars as numbers, NaN and infinity as null, else text."""
-    write_file(path, (json.dumps(_plain(value), indent=2, allow_nan=False) + "\n").encode())
+    write_file(path, to_json(value, indent=2, inf_nan_mode="null", fallback=_plain) + b"\n")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -32,13 +32,5 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value of JSON's types alone."""
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "item"):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if isinstance(value, str | int | float | None) else str(value)
+    """Return what stands for a value that JSON does not know."""
+    return value.item() if hasattr(value, "item") else str(value)

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.__main__ import main as benchmarks_main
 from touchgoal.launch.__main__ import main
-from touchgoal.runtime.parallel import worker_pool
+from touchgoal.runtime.parallel import parallel_map
 
 
 class _InProcess(Executor):
@@ -33,7 +33,7 @@ class _InProcess(Executor):
 def in_process_workers() -> Iterator[None]:
     """A process takes seconds to start; where its isolation is not the subject, none does."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worker_pool, "WorkerPool", lambda _: _InProcess())
+        patch.setattr(parallel_map, "WorkerPool", lambda _: _InProcess())
         yield
 
 

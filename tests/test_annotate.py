@@ -21,8 +21,12 @@ from visgel_scenes import (
 from touchgoal.encoders.annotation.annotate import annotate_all
 from touchgoal.encoders.annotation.boxes import iou
 from touchgoal.encoders.annotation.config import AnnotationSettings
-from touchgoal.encoders.annotation.records import AnnotatedTouch, read_annotations
-from touchgoal.encoders.annotation.touches import annotated_touches, open_annotations
+from touchgoal.encoders.annotation.records import (
+    AnnotatedTouch,
+    annotated_touches,
+    open_annotations,
+    read_annotations,
+)
 from touchgoal.episodes.importers.visgel import read_visgel_list
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError

@@ -38,8 +38,7 @@ from touchgoal.episodes.format.repair import validate
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.deploy import NOT_DONE, STOPPED
-from touchgoal.launch.support.cell_run import connect
-from touchgoal.launch.support.confirm import confirm
+from touchgoal.launch.support.cell_run import confirm, connect
 from touchgoal.launch.twin import open_to_network
 from touchgoal.runtime.errors import UserError
 

@@ -39,7 +39,7 @@ from touchgoal.launch.demo import FILMED
 from touchgoal.launch.deploy import NOT_DONE
 from touchgoal.rewards.distance.parts import FUSED, SMALLEST_UNIT, VALUE, WORDS
 from touchgoal.rewards.report.plot import CURVES
-from touchgoal.runtime.parallel.worker_pool import one_core_workers
+from touchgoal.runtime.parallel.parallel_map import one_core_workers
 
 Shell = Callable[[list[str]], int]
 ALL = list(commands())

@@ -13,8 +13,7 @@ import pytest
 from board_scene import BOARD, BoardScene, add_board, postures
 from PIL import Image
 
-from touchgoal.control.cell.camera_pose import write_camera
-from touchgoal.control.cell.cell_file import EXAMPLES, cell_table, read_cell_file
+from touchgoal.control.cell.cell_file import EXAMPLES, cell_table, read_cell_file, write_camera
 from touchgoal.control.hand_eye.board import BoardView
 from touchgoal.control.hand_eye.solve import HandEye, View, calibrate_camera, calibrate_hand_eye
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector

@@ -18,8 +18,7 @@ from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.judging.end_state import end_cost, end_costs, put_down
-from touchgoal.rewards.judging.fit_judge import fit_judge
-from touchgoal.rewards.judging.judge import Judge
+from touchgoal.rewards.judging.judge import Judge, fit_judge
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 from touchgoal.rewards.sources.open_source import open_source
 from touchgoal.runtime.errors import UserError

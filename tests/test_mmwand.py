@@ -18,10 +18,10 @@ from benchmarks.published_touch.objectfolder_real import (
 )
 from benchmarks.published_touch.tvl import read_tvl
 from touchgoal.control import features as ft
+from touchgoal.encoders.alignment.words import surface_ranks
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers
-from touchgoal.encoders.whitening.surface_words import surface_ranks
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.episodes.wand import recording as wand_recording

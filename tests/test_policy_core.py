@@ -28,9 +28,8 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint
 from touchgoal.policies.actions import Normalizer, to_actions, to_representation
 from touchgoal.policies.config import ActionRepresentation, SamplerConfig, TrainConfig
-from touchgoal.policies.heads.diffusion import DiffusionConfig
+from touchgoal.policies.heads.diffusion import FLOW_TIME_SCALE, DiffusionConfig, denoise
 from touchgoal.policies.heads.mlp import MLPConfig
-from touchgoal.policies.heads.samplers import FLOW_TIME_SCALE, denoise
 from touchgoal.policies.heads.unet import PRESETS, UNet
 from touchgoal.policies.network import PolicyConfig
 from touchgoal.policies.training import train as train_module

@@ -21,8 +21,7 @@ from touchgoal.launch.__main__ import main
 from touchgoal.rewards.report.frame_table import FRAMES
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.json_file import write_json
-from touchgoal.runtime.parallel.parallel_map import parallel_map
-from touchgoal.runtime.parallel.worker_pool import one_core_workers
+from touchgoal.runtime.parallel.parallel_map import one_core_workers, parallel_map
 
 NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
 DEMOS = "collect-demos --episodes 4 --env.objects glass_ball --env.control-hz 10 --env.no-tactile"

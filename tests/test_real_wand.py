@@ -30,7 +30,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.wand import recording as wand_recording
 from touchgoal.launch.__main__ import main
 from touchgoal.sim_envs.touch_wand import TouchWand
-from touchgoal.sim_envs.twin.mjpeg import Stream
+from touchgoal.sim_envs.twin.image_process import Stream
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
 from touchgoal.sim_envs.wand.objects import find_wand_object
 

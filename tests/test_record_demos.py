@@ -25,15 +25,14 @@ from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, ro
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.teleoperation.config import TeleoperationConfig
-from touchgoal.control.teleoperation.device import HandMotion, TeleoperationDevice
-from touchgoal.control.teleoperation.keyboard_device import KeyboardDevice
+from touchgoal.control.teleoperation.device import HandMotion, KeyboardDevice, TeleoperationDevice
 from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
 from touchgoal.control.teleoperation.teleoperator import Teleoperator, YieldingHand
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch import record_demos
 from touchgoal.launch.deploy import NOT_DONE
-from touchgoal.launch.support import confirm
+from touchgoal.launch.support import cell_run
 from touchgoal.runtime.errors import UserError
 
 OBSERVED: dict = {}
@@ -183,7 +182,7 @@ def test_own_demonstrations_train_a_policy_that_deploys(
     """At toy size: nothing is any good, and nothing knows more than the cell's sensors."""
     cell, down = write_cell_file(tmp_path, CELL), [0, 0, -0.5, 0, 0, 0]
     monkeypatch.setattr(record_demos, "_open_device", lambda *_: Pushed(down, ticks=20))
-    monkeypatch.setattr(confirm, "confirm", confirmed := MagicMock())
+    monkeypatch.setattr(cell_run, "confirm", confirmed := MagicMock())
     for name, seed, episodes in (("train", 0, 2), ("validation", 100_000, 1)):
         run("record-demos", cell, "--device", "scripted", "--episodes", episodes, "--seed", seed,
             "--out", tmp_path / name)  # fmt: skip

@@ -19,12 +19,10 @@ from touchgoal.encoders.ssl import train
 from touchgoal.encoders.ssl.config import DinoConfig, IJepaConfig, MaeConfig, VJepaConfig
 from touchgoal.encoders.ssl.dino import Dino
 from touchgoal.encoders.ssl.frames import TouchFrames, sample_frames
-from touchgoal.encoders.ssl.ijepa import IJepa
-from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction
+from touchgoal.encoders.ssl.jepa import IJepa, JointEmbeddingPrediction, VJepa
 from touchgoal.encoders.ssl.self_distillation import SelfDistillation
 from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.ssl.validation import token_statistics
-from touchgoal.encoders.ssl.vjepa import VJepa
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter

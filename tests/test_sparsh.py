@@ -16,10 +16,9 @@ from torch import Tensor
 
 import touchgoal
 from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
-from touchgoal.encoders.backbones.sparsh_weights import load_sparsh
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.pretrained import find_encoder, load_encoder, save
-from touchgoal.encoders.published import load_published
+from touchgoal.encoders.published import load_published, load_sparsh
 from touchgoal.policies.perception.frozen_touch import load_touch
 from touchgoal.runtime.errors import UserError
 

@@ -24,8 +24,7 @@ from touchgoal.encoders.towers.towers import (
     load_towers,
     same_towers,
 )
-from touchgoal.encoders.towers.wheels import wheel_folder
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, wheel_folder
 
 pytest.importorskip("transformers")
 IMAGENET_MILITARY_UNIFORM = 652

@@ -20,7 +20,7 @@ from touchgoal.control.cell.twin_client import lease_twin
 from touchgoal.control.sensors.load_cell import parse
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
-from touchgoal.sim_envs.twin.mjpeg import Stream
+from touchgoal.sim_envs.twin.image_process import Stream
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
 HOME = [0.0, -0.3, 0.0, -2.2, 0.0, 1.9, 0.785]

@@ -15,6 +15,7 @@ from numbered_images import BITS, numbered, until
 
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors import video
+from touchgoal.control.sensors.fingertip_source import find_sensor_camera, list_cameras
 from touchgoal.control.sensors.image_integrity import FrozenParts
 from touchgoal.control.sensors.live_image import StreamServer
 from touchgoal.control.sensors.tactile_camera import (
@@ -25,7 +26,6 @@ from touchgoal.control.sensors.tactile_camera import (
     crop_to_sensor,
     fingertip_view,
 )
-from touchgoal.control.sensors.usb_cameras import find_sensor_camera, list_cameras
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import (
@@ -36,7 +36,7 @@ from touchgoal.control.tactile.sensor_models import (
 )
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.tactile.markers import draw, rest_positions
-from touchgoal.sim_envs.twin.mjpeg import Stream
+from touchgoal.sim_envs.twin.image_process import Stream
 
 
 def number(image: np.ndarray) -> int:

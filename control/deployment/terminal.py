@@ -1,6 +1,5 @@
 """The operator's terminal during a deployment: keys, signals, and one status line."""
 
-import contextlib
 import os
 import select
 import signal
@@ -9,7 +8,7 @@ import termios
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, TextIO
 
 import numpy as np
@@ -17,6 +16,7 @@ import numpy as np
 from touchgoal.control.deployment.control_loop import Request, TickStatus
 from touchgoal.control.safety.action_filter import Mode
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.interruption import handling
 
 _CTRL_C = "\x03"
 
@@ -43,7 +43,7 @@ class Keyboard:
 
     def __exit__(self, *_: object) -> None:
         """Restore the terminal and drop unread keys, so that the shell does not get them."""
-        with contextlib.suppress(termios.error):  # it has gone
+        with suppress(termios.error):  # it has gone
             termios.tcsetattr(self._terminal, termios.TCSAFLUSH, self._before)
 
     def read_keys(self) -> str:
@@ -157,13 +157,10 @@ class Terminal:
     @contextmanager
     def watching(self) -> Iterator[None]:
         """Take keys and signals as requests while this lasts."""
-        before = {number: signal.signal(number, self._on_signal) for number in _SIGNALS}
         try:
-            with self._keyboard or nullcontext():
+            with handling(_SIGNALS, self._on_signal), self._keyboard or nullcontext():
                 yield
         finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
             if self._shows:
                 print()
 

@@ -152,17 +152,16 @@ def _make(name: str, found: Any) -> Policy:
 
 def _import(name: str) -> Any:
     place, _, attribute = name.rpartition(":")
-    module = _import_file(Path(place)) if place.endswith(".py") else _import_module(place)
+    if place.endswith(".py"):
+        module = _import_file(Path(place))
+    else:
+        with _their_mistakes_named(place):
+            module = importlib.import_module(place)
     found = getattr(module, attribute, None)
     if found is None:
         classes = [key for key, value in vars(module).items() if isinstance(value, type)]
         raise unknown_name(f"policy in {place}", attribute, classes)
     return found
-
-
-def _import_module(name: str) -> Any:
-    with _their_mistakes_named(name):
-        return importlib.import_module(name)
 
 
 def _import_file(path: Path) -> Any:

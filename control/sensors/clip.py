@@ -138,12 +138,11 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def in_natural_order(paths: Iterable[Path]) -> list[Path]:
-    """Sort paths by name, numbers by value: 2 before 10."""
-    return sorted(paths, key=lambda path: _natural_order(path.name))
-
-
-def _natural_order(name: str) -> list[tuple[str, int]]:
-    return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name)]
+    """Sort paths, numbers in them by value: 2 before 10."""
+    return sorted(
+        paths,
+        key=lambda path: [(t, int(n or 0)) for t, n in re.findall(r"(\D*)(\d*)", str(path))],
+    )
 
 
 def refuse_other_format(path: Path) -> None:

@@ -1,7 +1,6 @@
 """The actor of a teleoperated run: the device's motion, and a hand that yields to what it presses on.
 
-Its actions pass the control loop's safety layer like any policy's.
-"""
+Its actions pass the control loop's safety layer like any policy's."""
 
 from collections.abc import Callable
 
@@ -11,12 +10,41 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
-from touchgoal.control.motion.compliance import Compliance
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.teleoperation.config import COMPLIANCE, TeleoperationConfig
 from touchgoal.control.teleoperation.device import TeleoperationDevice
+
+_FREE_FORCE = 3.0  # N beyond the first reading that count as none: the weight of a carried object
+
+
+class Compliance:
+    """Velocity with which the hand gives way to forces beyond those at rest."""
+
+    def __init__(self, force: float, torque: float, free_torque: float) -> None:
+        """Take the speed per force, m/s per N, and per torque, rad/s per Nm.
+
+        Torques up to `free_torque` (Nm) beyond the first reading count as none.
+        """
+        self._force, self._torque, self._free_torque = force, torque, free_torque
+
+    def start(self, observation: Observation) -> None:
+        """Take the wrench as that of the free hand."""
+        self._at_rest = observation[ft.WRENCH].astype(np.float64)
+
+    def velocity(self, observation: Observation) -> Float[np.ndarray, "6"]:
+        """Return the hand's velocity, base frame (m/s, rad/s); none where the wrench is unknown."""
+        force, torque = (observation[ft.WRENCH] - self._at_rest).reshape(2, 3)
+        moved = self._force * _beyond(force, _FREE_FORCE)
+        return np.concatenate([moved, self._torque * _beyond(torque, self._free_torque)])
+
+
+def _beyond(vector: Float[np.ndarray, "3"], free: float) -> Float[np.ndarray, "3"]:
+    """Return a vector shortened by `free`; NaN, as near an arm's singularity, counts as none."""
+    length = float(np.linalg.norm(vector))
+    return vector * (1 - free / length) if length > free else np.zeros(3)
+
 
 # Nm. The drift of an arm's own estimate passes it and turns the hand a little, which is corrected: of
 # recordings without that, policies learned to hover above what they are to grasp.
@@ -66,7 +94,7 @@ _MORE = 2  # times as much as a led hand: a policy sees where to stop less well 
 _UNCORRECTED_TORQUE = 0.6
 
 
-class YieldingHand:
+class YieldingHand(Compliance):
     """Adds to a policy's actions the motion with which a hand yields, twice that of a led one.
 
     The policy learned from demonstrations in which it did; without it the hand presses harder.
@@ -77,17 +105,13 @@ class YieldingHand:
         self._commanded, self._dt = commanded, safety.dt
         self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
         linear, angular = COMPLIANCE
-        self._compliance = Compliance(_MORE * linear, _MORE * angular, _UNCORRECTED_TORQUE)
-
-    def start(self, observation: Observation) -> None:
-        """Take the wrench as that of the free hand."""
-        self._compliance.start(observation)
+        super().__init__(_MORE * linear, _MORE * angular, _UNCORRECTED_TORQUE)
 
     def add_to(
         self, action: Float[np.ndarray, " n"], observation: Observation
     ) -> Float[np.ndarray, " n"]:
         """Return the action of this tick with the yielding added."""
-        velocity = self._compliance.velocity(observation)
+        velocity = self.velocity(observation)
         if not velocity.any():
             return action
         change = self._kinematics.joint_change(self._commanded(), self._dt * velocity)

@@ -13,9 +13,8 @@ from touchgoal.encoders.ssl import mae
 from touchgoal.encoders.ssl.config import DinoConfig, IJepaConfig, MaeConfig, VJepaConfig
 from touchgoal.encoders.ssl.dino import Dino
 from touchgoal.encoders.ssl.frames import TouchFrames
-from touchgoal.encoders.ssl.ijepa import IJepa
+from touchgoal.encoders.ssl.jepa import IJepa, VJepa
 from touchgoal.encoders.ssl.validation import Validation
-from touchgoal.encoders.ssl.vjepa import VJepa
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process

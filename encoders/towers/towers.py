@@ -16,8 +16,7 @@ from torch import Tensor
 from touchgoal.encoders.compiled_network import CompiledNetwork
 from touchgoal.encoders.towers import efficientnet, minilm
 from touchgoal.encoders.towers.transformers_models import load_model, load_part
-from touchgoal.encoders.towers.wheels import wheel_folder
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, wheel_folder
 
 BATCH = 32
 _CPU_IMAGES = 4  # images that a core takes at a time

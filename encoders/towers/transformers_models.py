@@ -5,8 +5,7 @@ from typing import Any
 
 import torch
 
-from touchgoal.encoders.towers.wheels import wheel_folder
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, wheel_folder
 
 
 def load_model(source: str, class_name: str, model_type: str, device: str) -> Any:

@@ -125,11 +125,7 @@ def _fetch(url: str, name: str, root: Path) -> None:
             raise FileNotFoundError
         _make_room(root, there.size)
         unfinished = Path(part) / path.name
-        with (
-            filesystem.open_input_stream(there.path, compression=None) as source,
-            unfinished.open("wb") as target,
-        ):
-            shutil.copyfileobj(source, target, 1 << 20)
+        fs.copy_files(there.path, str(unfinished), filesystem, fs.LocalFileSystem())
         os.utime(unfinished, (0, _seconds(there)))
         os.replace(unfinished, path)
 

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from touchgoal.control.sensors.clip import in_natural_order
 from touchgoal.episodes.importers import touch_clip
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
@@ -76,7 +77,7 @@ def read_recordings(folder: Path, sensor: str | None = None) -> list[Recording]:
     """
     if not folder.is_dir():
         raise UserError(f"{folder} is no folder")
-    slides = sorted(folder.glob("*/dataset_*.pkl"), key=_natural)
+    slides = in_natural_order(folder.glob("*/dataset_*.pkl"))
     if slides := [path for path in slides if re.fullmatch(r"dataset_\d+\.pkl", path.name)]:
         recordings = _slides(folder, slides, touch_clip.check_sensor(sensor, ("digit",), folder))
     else:
@@ -88,7 +89,7 @@ def read_recordings(folder: Path, sensor: str | None = None) -> list[Recording]:
 
 def _slides(folder: Path, paths: list[Path], sensor: str) -> list[Recording]:
     """Hold out the last recording of each object, as published, or the last one of all."""
-    backgrounds = tuple(sorted((folder / "bgs").glob("bg_*.jpg"), key=_natural))
+    backgrounds = tuple(in_natural_order((folder / "bgs").glob("bg_*.jpg")))
     last = {path.parent: path for path in paths}
     held_out = {paths[-1]} if len(last) == len(paths) else set(last.values())
     return [Recording(path, sensor, path in held_out, False, backgrounds) for path in paths]
@@ -110,7 +111,3 @@ def _gelsights(folder: Path, sensor: str | None) -> list[Recording]:
         "OBJECT/dataset_0.pkl (YCB-Slide, Touch-Slide), 20220410_031604.pkl (Touch-and-Go), "
         "001.pkl (ObjectFolder), videos with labels.csv (PhysiCLeAR)"
     )
-
-
-def _natural(path: Path) -> list[str | int]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", str(path))]

@@ -6,12 +6,14 @@ judge ended tells its verdict in meta `judged`, which this file overrides.
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
+from pydantic import TypeAdapter, ValidationError
+
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.json_file import write_json
 
 JUDGED = "judged.json"
 Verdict = Literal["success", "failure", "unsure"]
@@ -35,12 +37,8 @@ def read_judged(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
     if not path.is_file():
         return found
     try:
-        rows = json.loads(path.read_text())
-        return found | {
-            int(i): JudgedOutcome(**{**row, "reasons": tuple(row["reasons"])})
-            for i, row in rows.items()
-        }
-    except (ValueError, TypeError, AttributeError, KeyError):
+        return found | TypeAdapter(dict[int, JudgedOutcome]).validate_json(path.read_bytes())
+    except ValidationError:
         raise UserError(f"{path} is damaged: delete it and judge the set again") from None
 
 
@@ -48,5 +46,4 @@ def write_judged(episodes: EpisodeSet, outcomes: Mapping[int, JudgedOutcome]) ->
     """Write outcomes beside those that the set's file has already, atomically."""
     path = episodes.root / JUDGED
     rows = json.loads(path.read_text()) if path.is_file() else {}
-    rows |= {str(i): asdict(outcome) for i, outcome in outcomes.items()}
-    write_file(path, (json.dumps(rows, indent=1) + "\n").encode())
+    write_json(path, rows | {str(i): outcome for i, outcome in outcomes.items()})

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from touchgoal.encoders.alignment.align import align
 from touchgoal.encoders.alignment.wand_set import WandSet, is_wand_set
-from touchgoal.encoders.annotation.touches import open_annotations
+from touchgoal.encoders.annotation.records import open_annotations
 from touchgoal.encoders.ssl.frames import find_sensor_name
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.run import check_run, open_sets, open_training, recipe

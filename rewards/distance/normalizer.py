@@ -6,15 +6,16 @@ on. Scaling each episode by its own extremes would make a perfect curve of noise
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import TypeAdapter
 
 from touchgoal.control.features import TRUTH_FAILURE, TRUTH_PROGRESS, TRUTH_START
-from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.json_file import write_json
 
 NORMALIZER = "normalizer.json"
 """Name of the file in an encoder's folder, fitted on the encoder's training episodes."""
@@ -123,8 +124,7 @@ class DistanceNormalizer:
 
     def save(self, path: Path) -> None:
         """Write JSON, atomically."""
-        content = {"format": _FORMAT, **asdict(self)}
-        write_file(path, (json.dumps(content, indent=2) + "\n").encode())
+        write_json(path, {"format": _FORMAT, **asdict(self)})
 
     @classmethod
     def load(cls, path: Path) -> "DistanceNormalizer":
@@ -138,15 +138,13 @@ class DistanceNormalizer:
             )
         try:
             content = json.loads(path.read_text())
-            if content.pop("format", 1) != _FORMAT:
-                raise UserError(
-                    f"{path} was fitted by another version of touchgoal and lacks the units of the "
-                    "parts: fit it anew with touchgoal fit-normalizer"
-                )
-            if content.keys() != {f.name for f in fields(cls)}:
-                raise ValueError
-            return cls(**content | {"source": EmbeddingSource(**content["source"])})
+            if content.pop("format", 1) == _FORMAT:
+                return TypeAdapter(cls).validate_python(content)
         except (ValueError, RecursionError, AttributeError, TypeError):
             raise UserError(
                 f"{path} is not a normalizer: make one with touchgoal fit-normalizer"
             ) from None
+        raise UserError(
+            f"{path} was fitted by another version of touchgoal and lacks the units of the parts: "
+            "fit it anew with touchgoal fit-normalizer"
+        )

@@ -7,18 +7,23 @@ failures, which must be made on purpose, success is told only up to the stricter
 successes exceed; how many failures pass is then unknown.
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from touchgoal.encoders.pretrained import DEFAULT_ENCODER
 from touchgoal.episodes.outcomes.judged import Verdict
-from touchgoal.runtime.atomic_write import write_file
+from touchgoal.rewards.distance.fit_normalizer import fit_units
+from touchgoal.rewards.features.embedded import EmbeddedEpisode
+from touchgoal.rewards.features.successful_ends import SuccessfulEnds
+from touchgoal.rewards.judging.end_state import end_cost, end_costs
+from touchgoal.rewards.value import Value, fit_value
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.json_file import write_json
 
 FIT_JUDGE = "fit one with touchgoal fit-normalizer --judge"
 SHIPPED_JUDGE = DEFAULT_ENCODER.name
@@ -26,6 +31,7 @@ SHIPPED_JUDGE = DEFAULT_ENCODER.name
 JUDGE = "judge.json"
 """Name of the file, beside the normalizer."""
 WRONG = 0.1  # bound on the share of successes called failures, and of failures called successes
+_FOLDS = 4  # of the successes: three fit what measures the fourth
 _DOUBTED = 0.4  # share of successes that are not called so where failures are missing
 LEAST_SUCCESSES, LEAST_FAILURES = 9, 20
 
@@ -111,19 +117,14 @@ class Judge:
 
     def save(self, path: Path) -> None:
         """Write JSON, atomically."""
-        write_file(path, (json.dumps(asdict(self), indent=2) + "\n").encode())
+        write_json(path, self)
 
     @classmethod
     def load(cls, path: Path) -> "Judge":
         """Read what `save` wrote; UserError: no such file, or another one."""
         try:
-            content = json.loads(path.read_text())
-            if content.keys() != {field.name for field in fields(cls)}:
-                raise ValueError
-            return cls(
-                tuple(map(float, content["successes"])), tuple(map(float, content["failures"]))
-            )
-        except (OSError, ValueError, TypeError, AttributeError):
+            return TypeAdapter(cls).validate_json(path.read_bytes())
+        except (OSError, ValueError):
             raise UserError(f"{path} is no judge: {FIT_JUDGE}") from None
 
 
@@ -142,3 +143,33 @@ def _quantile(costs: Sequence[float], beyond: float) -> float:
     """Return the ceil((k + 1)(1 - beyond))-th smallest cost, the largest if there are too few."""
     rank = math.ceil(round((len(costs) + 1) * (1 - beyond), 9))
     return float(np.sort(costs)[min(rank, len(costs)) - 1])
+
+
+def fit_judge(
+    successes: Sequence[EmbeddedEpisode], failures: Sequence[EmbeddedEpisode], value: Value | None
+) -> Judge:
+    """Return the judge of successes, each measured by the other three of 4 folds, and of failures.
+
+    Units, goals and, where `value` of all successes is given, a value are fitted anew to each three
+    folds; failures are measured by all successes. An episode whose object no success (in another fold)
+    has is left out. UserError: fewer than 9 successes are left.
+    """
+    by_object = sorted(successes, key=lambda e: e.object)  # each object in as many folds as can be
+    costs: list[float] = []
+    for fold in range(_FOLDS):
+        others = [e for i, e in enumerate(by_object) if i % _FOLDS != fold]
+        refitted = None if value is None else fit_value(others, value.config.task)
+        costs += _costs(by_object[fold::_FOLDS], others, refitted)
+    return Judge(tuple(costs), tuple(_costs(failures, successes, value)))
+
+
+def _costs(
+    episodes: Sequence[EmbeddedEpisode], successes: Sequence[EmbeddedEpisode], value: Value | None
+) -> list[float]:
+    units, ends = fit_units(successes), SuccessfulEnds.of(successes)
+    measured = [e for e in episodes if e.object in ends.objects]
+    goals = [ends.for_trajectory(e, "the successes") for e in measured]
+    return [
+        end_cost(end_costs(e.features, e.fps, goal, units, value))
+        for e, goal in zip(measured, goals, strict=True)
+    ]

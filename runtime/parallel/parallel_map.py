@@ -1,18 +1,29 @@
-"""Map of a function over items, on the cores of this machine or of a Ray cluster."""
+"""Map of a function over items, on the cores of this machine or of a Ray cluster.
 
+Worker processes have one core each, and end with the process that started them.
+"""
+
+import logging
+import multiprocessing
+import os
+import signal
 import sys
+import threading
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, TypeVar
 
-from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.parallel.ray_cluster import RETRIES, ray_cluster
-from touchgoal.runtime.parallel.worker_pool import one_core_workers
+import cv2
+
+from touchgoal.runtime.errors import UserError, install_extra
 
 Workers = int | str
 """Number of processes on this machine, or the address of a Ray cluster ("auto": the one started here)."""
@@ -21,6 +32,95 @@ Result = TypeVar("Result")
 Results = Generator[Result, None, None]
 
 _AHEAD = 8  # items per core, in work or waiting to be read, so that a slow one leaves no core idle
+_LOOK = 1.0  # s between two looks at the workers
+
+
+class WorkerPool(ProcessPoolExecutor):
+    """Processes of one core each; the death of one in the middle of a result is noticed, too.
+
+    Python's pool would wait for the rest of that result, because it holds the pipe's other end itself; and
+    at its end for the others, because a worker that dies while it waits for work keeps the queue locked.
+    """
+
+    def __init__(self, workers: int) -> None:
+        # OpenGL contexts do not survive a fork, so workers are forked from a server that never
+        # renders; it imports once what this process has imported
+        forkserver = multiprocessing.get_context("forkserver")
+        forkserver.set_forkserver_preload(
+            [m for m in sys.modules if m.startswith(("touchgoal.", "benchmarks."))]
+        )
+        super().__init__(workers, mp_context=forkserver, initializer=_begin_work)
+        self._ended = threading.Event()
+        threading.Thread(target=self._notice_death, daemon=True).start()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """See Executor."""
+        try:
+            super().shutdown(wait, cancel_futures=cancel_futures)
+        finally:
+            self._ended.set()
+
+    def end_at_once(self) -> None:
+        """Kill the workers and drop all work."""
+        self._kill()
+        self.shutdown(cancel_futures=True)
+
+    def _notice_death(self) -> None:
+        while not self._ended.wait(_LOOK):
+            dead = wait([worker.sentinel for worker in self._workers()], timeout=0)
+            if dead and not self._ended.wait(_LOOK) and not self._broken:
+                self._kill()
+                return
+
+    def _kill(self) -> None:
+        results = self._result_queue  # the pool lets go of it once its workers have ended
+        for worker in self._workers():
+            worker.kill()
+            worker.join()
+        if results is not None:
+            with suppress(OSError):  # the pool's own thread may close it at the same time
+                results._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _workers(self) -> list[BaseProcess]:
+        """Return the workers; none before the first task and after the end."""
+        return list((self._processes or {}).values())
+
+
+@contextmanager
+def one_core_workers(workers: int) -> Iterator[WorkerPool]:
+    """Open a pool of processes that use one core each.
+
+    If the block ends early, by Ctrl-C for example, or if this process is killed, the workers end at
+    once and drop their current work.
+    """
+    pool = WorkerPool(workers)
+    try:
+        yield pool
+    except BaseException:
+        pool.end_at_once()
+        raise
+    pool.shutdown()
+
+
+def use_one_core() -> None:
+    """Start no threads in OpenCV or software OpenGL."""
+    cv2.setNumThreads(1)
+    os.environ["LP_NUM_THREADS"] = "1"
+
+
+def _begin_work() -> None:
+    """Ignore Ctrl-C, which the parent handles, and end with the parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    use_one_core()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent is gone; the fork server and its tracker follow the last one."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    os._exit(1)
 
 
 def parallel_map(
@@ -95,3 +195,66 @@ def _in_order(
         submitted.append(submit(item))
     while submitted:
         yield wait(submitted.popleft())
+
+
+RETRIES = 3  # times that an item is computed again after its worker or its node died
+
+
+@dataclass(frozen=True)
+class RayCluster:
+    """A cluster that this process is connected to; `ray` is the module."""
+
+    ray: Any
+
+    def cores(self) -> int:
+        """Return the number of cores, which changes as nodes come and go."""
+        return int(self.ray.cluster_resources().get("CPU", 1))
+
+    def task(self, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """Return what submits an item and returns the reference of its result.
+
+        Ray retries after deaths, and computes a result again if it is lost with its node.
+        """
+        sent = self.ray.put(function)  # is sent once per node, not once per item
+        task = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
+        return lambda item: task.remote(sent, item)
+
+    def result(self, reference: Any) -> Any:
+        """Wait for a result; raise what the function raised, UserError if its workers died."""
+        try:
+            return reference.future().result()  # `ray.get` takes SIGTERM for Ctrl-C
+        except self.ray.exceptions.RayTaskError as error:
+            raise error.cause from error
+        except self.ray.exceptions.RayError as error:
+            reason = str(error).strip().splitlines()[0]
+            raise UserError(f"the cluster lost an item {RETRIES + 1} times: {reason}") from error
+
+
+@contextmanager
+def ray_cluster(address: str) -> Iterator[RayCluster]:
+    """Connect to a cluster; at the end unfinished work of this process is dropped.
+
+    UserError: Ray is not installed, or no cluster answers.
+    """
+    try:
+        import ray
+    except ImportError:
+        raise UserError(f"--ray needs Ray: {install_extra('ray')}") from None
+    on_sigterm = signal.getsignal(signal.SIGTERM)
+    try:
+        ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise UserError(
+            f"--ray {address}: {reason}; start a cluster by: ray start --head"
+        ) from error
+    signal.signal(signal.SIGTERM, on_sigterm)  # Ray's would end this process without a word
+    try:
+        yield RayCluster(ray)
+    finally:
+        ray.shutdown()
+
+
+def _call(function: Callable[[Any], Any], item: Any) -> Any:
+    use_one_core()
+    return function(item)

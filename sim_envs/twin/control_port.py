@@ -54,7 +54,7 @@ from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort, S
 from touchgoal.sim_envs.twin.ur.controller import UrController
 
 _HTTP = re.compile(r" HTTP/\d")  # end of a browser's first line
-# Faults of a stream by order: attributes of `mjpeg.Stream`.
+# Faults of a stream by order: attributes of `image_process.Stream`.
 _STREAM_FAULTS = {"stall": "stalled", "repeat": "frozen", "lose": "lost"}
 _STREAM_FAULTS |= {"break": "broken", "halve": "halved"}
 _SWITCH = {"on": True, "off": False}

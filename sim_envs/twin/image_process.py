@@ -1,6 +1,7 @@
 """The process that renders and serves a twin's images, so that physics does not wait for it.
 
-It follows the physics by its state, and ends when the twin closes its end of the pipe.
+It follows the physics by its state, spoils its streams on request, and ends when the twin closes its end
+of the pipe.
 """
 
 import signal
@@ -11,20 +12,74 @@ from multiprocessing.connection import Connection
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from touchgoal.control import features as ft
-from touchgoal.control.sensors.live_image import StreamServer
+from touchgoal.control.arrays import Image
+from touchgoal.control.sensors import live_image
 from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
 from touchgoal.sim_envs.tactile.pad import TactilePad
-from touchgoal.sim_envs.twin.mjpeg import Stream
+
+_JPEG_HEADER = 640  # bytes of OpenCV's
+_SENDING_TIMEOUT = 2.0  # s
+
+
+@dataclass(eq=False)
+class Stream(live_image.Stream):
+    """One stream of images, as a camera sends them that may fail."""
+
+    # stalled, frozen, lost, broken, halved: until when (time.monotonic) nothing comes, one image
+    # repeats, clients are cut off and turned away, JPEGs have wrong bytes or are cut in half
+    stalled: float = 0.0
+    frozen: float = 0.0
+    lost: float = 0.0
+    broken: float = 0.0
+    halved: float = 0.0
+
+    @property
+    def has_viewers(self) -> bool:
+        """Whether a client would get an image."""
+        return self.clients > 0 and time.monotonic() >= self.stalled
+
+    def publish(self, image: Image) -> None:
+        """Publish an image to all clients."""
+        frozen = self.image if time.monotonic() < self.frozen else None
+        super().publish(image if frozen is None else frozen)
+
+    def wait_until_sent(self) -> None:
+        """Wait until the last image is on its way to its clients."""
+        with self.condition:
+            self.condition.wait_for(
+                lambda: self.sent >= self.count or not self.clients, _SENDING_TIMEOUT
+            )
+
+    def encode(self, image: Image) -> bytes:
+        """Return an image as a JPEG, spoilt as long as it is asked for."""
+        jpeg, now = super().encode(image), time.monotonic()
+        if now < self.halved:
+            return jpeg[: len(jpeg) // 2]
+        return _with_random_bytes(jpeg) if now < self.broken else jpeg
+
+    def is_open(self) -> bool:
+        """Return whether clients are served."""
+        return time.monotonic() >= self.lost
+
+    def end(self) -> None:
+        """Serve nobody any more."""
+        self.lost = np.inf
+
+
+def _with_random_bytes(jpeg: bytes) -> bytes:
+    rng, damaged = np.random.default_rng(), np.frombuffer(jpeg, np.uint8).copy()
+    places = rng.integers(_JPEG_HEADER, len(jpeg) - 2, 20)
+    damaged[places] = rng.integers(0, 256, 20)
+    return damaged.tobytes()
+
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # everything that an image depends on
 _CAMERA_NOISE = 1.5  # counts: lets a driver tell a still scene from a frozen camera
 _TACTILE = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
-
-Image = UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -98,7 +153,7 @@ def serve(pipe: Connection, host: str, port: int, names: list[str]) -> None:
     """
     streams = {name: Stream() for name in names}
     try:
-        server = StreamServer(streams, host, port)
+        server = live_image.StreamServer(streams, host, port)
     except OSError as error:
         pipe.send(error)
         return

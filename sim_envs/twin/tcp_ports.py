@@ -37,6 +37,11 @@ class ClientConnection:
         """Return the descriptor, for `select`."""
         return self._socket.fileno()
 
+    @property
+    def host(self) -> str:
+        """Address that it comes from."""
+        return self._socket.getpeername()[0]
+
     def read(self) -> None:
         """Receive bytes that have arrived."""
         try:
@@ -90,14 +95,19 @@ class ListeningPort:
         """Return the descriptor, for `select`."""
         return self._socket.fileno()
 
-    def poll(self) -> list[ClientConnection]:
-        """Accept new clients, receive from all, drop those who left."""
+    def accept(self) -> ClientConnection | None:
+        """Greet and return a new client, if there is one."""
         try:
             client = ClientConnection(self._socket.accept()[0])
-            client.send(self._greeting)
-            self.clients.append(client)
         except BlockingIOError:
-            pass
+            return None
+        client.send(self._greeting)
+        return client
+
+    def poll(self) -> list[ClientConnection]:
+        """Accept new clients, receive from all, drop those who left."""
+        if client := self.accept():
+            self.clients.append(client)
         for client in self.clients:
             client.read()
             if not client.open:

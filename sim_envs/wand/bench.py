@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from touchgoal.sim_envs.scene.build import HIDDEN_GROUP, OBJECT_GROUP, VISUAL_GROUP, look_at
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture
-from touchgoal.sim_envs.wand.meshes import Mesh
-from touchgoal.sim_envs.wand.objects import Part, WandObject
+from touchgoal.sim_envs.wand.objects import Mesh, Part, WandObject
 
 VIEWS = ("top", "side_left", "side_right", "wand")
 """Cameras: overhead, from both sides, and the point of view on the wand."""

@@ -18,7 +18,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from touchgoal.control.sensors.live_image import StreamServer
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
-from touchgoal.sim_envs.twin.mjpeg import Stream
+from touchgoal.sim_envs.twin.image_process import Stream
 
 CELL = """
 arm = "sim"

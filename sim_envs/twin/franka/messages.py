@@ -7,15 +7,16 @@ state is packed in 20 us instead of franky-sim's 0.3 ms.
 import select
 import socket
 import struct
-import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
+from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
+
 ROBOT_PORT, HAND_PORT = 1337, 1338
 ROBOT_VERSION, HAND_VERSION = 10, 3
-_SEND_TIMEOUT = 0.5  # s that a client may take to read an answer
 _ABSURD = 1e6  # larger than any setting of an arm, in any unit
 _LONGEST = 4096  # bytes of a command; the longest of the protocol has 300
 
@@ -211,17 +212,13 @@ class Link:
         self._version, self._wide = version, wide
         self._header = struct.Struct("<III" if wide else "<HII")
         self._status = struct.Struct("<B" if wide else "<H")
-        self._listener = socket.socket()
-        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self._listener.bind((host, port))
-        self._listener.listen(1)
-        self._listener.setblocking(False)
+        self._listener = ListeningPort(host, port)
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.bind((host, 0))
         self._udp.setblocking(False)
-        self._tcp: socket.socket | None = None
+        self._tcp: ClientConnection | None = None
         self._peer: tuple[str, int] | None = None
-        self._unread = self._unsent = b""
+        self._unsent = b""  # while the link is frozen
         self.frozen = False  # nothing gets through in either direction
 
     @property
@@ -230,7 +227,7 @@ class Link:
         return self._peer is not None
 
     @property
-    def sockets(self) -> list[socket.socket]:
+    def sockets(self) -> list[ListeningPort | ClientConnection | socket.socket]:
         """Sockets on which a client may send."""
         return [self._listener if self._tcp is None else self._tcp, self._udp]
 
@@ -238,21 +235,15 @@ class Link:
         """Return commands that have arrived; accept a new client."""
         if self.frozen:
             return []
+        self._tcp = self._tcp or self._listener.accept()
+        if self._tcp is None:
+            return []
         self._flush()
-        if self._tcp is None and not self._accept():
-            return []
-        assert self._tcp is not None
-        try:
-            chunk = self._tcp.recv(65536)
-        except BlockingIOError:
-            return []
-        except OSError:
-            chunk = b""
-        if not chunk:
+        self._tcp.read()
+        if not self._tcp.open:
             self.drop()
             return []
-        self._unread += chunk
-        return list(self._parse_requests())
+        return list(self._parse_requests(self._tcp))
 
     def orders(self) -> list[bytes]:
         """Return datagrams that have arrived."""
@@ -285,8 +276,7 @@ class Link:
         """Close the client's connection."""
         if self._tcp is not None:
             self._tcp.close()
-        self._tcp = self._peer = None
-        self._unread = self._unsent = b""
+        self._tcp, self._peer, self._unsent = None, None, b""
 
     def close(self) -> None:
         """Close everything."""
@@ -294,26 +284,17 @@ class Link:
         self._listener.close()
         self._udp.close()
 
-    def _accept(self) -> bool:
-        try:
-            self._tcp, _ = self._listener.accept()
-        except BlockingIOError:
-            return False
-        self._tcp.setblocking(False)
-        self._tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return True
-
-    def _parse_requests(self):
+    def _parse_requests(self, client: ClientConnection) -> Iterator[Request]:
         size = self._header.size
-        while len(self._unread) >= size:
-            command, id, length = self._header.unpack_from(self._unread)
+        while len(client.unread) >= size:
+            command, id, length = self._header.unpack_from(client.unread)
             if not size <= length <= _LONGEST:
                 self.drop()  # not libfranka
                 return
-            if len(self._unread) < length:
+            if len(client.unread) < length:
                 return
-            request = Request(command, id, self._unread[size:length])
-            self._unread = self._unread[length:]
+            request = Request(command, id, client.unread[size:length])
+            client.unread = client.unread[length:]
             if not self._well_formed(request):
                 self.drop()
                 return
@@ -340,7 +321,7 @@ class Link:
     def _handshake(self, request: Request) -> None:
         assert self._tcp is not None
         _, port = struct.unpack_from("<HH", request.payload)
-        self._peer = self._tcp.getpeername()[0], port
+        self._peer = self._tcp.host, port
         self._write(request, struct.pack("<HH4x", 0, self._version))
 
     def _write(self, request: Request, body: bytes) -> None:
@@ -351,14 +332,7 @@ class Link:
         self._flush()
 
     def _flush(self) -> None:
-        """Send what waits, unless the link is frozen; drop a client that does not take it."""
-        deadline = time.monotonic() + _SEND_TIMEOUT
-        while self._unsent and self._tcp is not None and not self.frozen:
-            try:
-                self._unsent = self._unsent[self._tcp.send(self._unsent) :]
-            except BlockingIOError:
-                select.select([], [self._tcp], [], _SEND_TIMEOUT)
-                if time.monotonic() > deadline:
-                    self.drop()
-            except OSError:
-                self.drop()
+        """Send what waits, unless the link is frozen."""
+        if self._tcp is not None and not self.frozen:
+            self._tcp.send(self._unsent)
+            self._unsent = b""
