@@ -5,7 +5,6 @@ front camera is turned and moved, and the light changed, in most of them; the ha
 """
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 from touchgoal.encoders.training.options import TrainerOptions
@@ -67,8 +66,7 @@ def main(config: Config) -> None:
     first = seeds.POSE_VALIDATION.start
     varied = Variety(hand_anywhere=0, hand_over=0)
     others = render_placements(env, few, 10, first + few, config.workers, varied)
-    sure, refused = pose_training.fit_sure(network, others)
-    network.config = replace(network.config, sure=sure, second=pose_training.SECOND)
+    network.config, refused = pose_training.fit_trust(network, others)
     print(f"refused: {refused['good']:.1%} of good estimates, {refused['bad']:.0%} of bad ones")
     errors = {}
     for where, variety in (

@@ -101,9 +101,9 @@ class PoseEstimatorConfig:
     # Least share of the first look near the object and near the goal, least length of the vector of the
     # yaw, and least probability of an unmirrored image, in which the estimate is trusted; training sets them.
     sure: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    # Most share of the first look at another place than the object's; training sets it. One such object
-    # leaves at most 0.02 in 24 scenes, two or three at least 0.06 in 24.
-    second: float = 1.0
+    # Most share of the first look at another place than the object's, without a sentence and with one;
+    # training sets it.
+    second: tuple[float, float] = (1.0, 1.0)
     front_camera: CameraPlacement = USUAL_CAMERA  # where it stood in training, up to its changes
 
 

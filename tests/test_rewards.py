@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from touchgoal.control.features import TACTILE_LEFT, TACTILE_RIGHT
 from touchgoal.rewards.curves import Contact, Curves, potential_reward
 from touchgoal.rewards.distance.cost import compute_curves, plain_distances
-from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
+from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, separating
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal, take_rows
 from touchgoal.rewards.goals import (
@@ -194,6 +194,8 @@ def test_touch_goals_are_ends_with_the_same_object() -> None:
         fit_scene([apple, replace(pear, object="apple")], ["tactile"])
     with pytest.raises(UserError, match="they must share an object"):
         fit_scene([apple, pear], ["tactile"])
+    found, [why] = separating([apple, pear])
+    assert found == ["image"] and "share an object" in why
 
 
 def test_scale_refuses_what_would_mislead() -> None:

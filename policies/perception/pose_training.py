@@ -1,7 +1,7 @@
 """Training of the pose estimator on rendered placements."""
 
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
-from touchgoal.policies.config import Box, PoseTrainConfig
+from touchgoal.policies.config import Box, PoseEstimatorConfig, PoseTrainConfig
 from touchgoal.policies.perception.placements import Placements
 from touchgoal.policies.perception.pose_estimator import Look, PoseEstimator, evenly_lit
 from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
@@ -22,7 +22,6 @@ from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
 _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose counts linearly
 _FINDER_ROWS = 4  # the first look, which learns faster, is trained on one of so many samples
 _WORD_NOISE = 0.015  # standard deviation of each number of a sentence's embedding of length 1
-SECOND = 0.04  # see `PoseEstimatorConfig.second`
 _PLACE_NOISE = 8.0  # px by which crops are off in training: a cell of the first look
 _PIXEL_NOISE = 4  # largest change of a pixel by simulated camera noise, grey levels
 _BATCH = 64
@@ -168,28 +167,34 @@ def _add_pixel_noise(
 
 
 @torch.no_grad()
-def fit_sure(
+def fit_trust(
     estimator: PoseEstimator, placements: Placements
-) -> tuple[tuple[float, float, float, float], dict[str, float]]:
-    """Return `PoseEstimatorConfig.sure`, and the shares of good and of bad estimates refused by it.
+) -> tuple[PoseEstimatorConfig, dict[str, float]]:
+    """Return the config with `sure` and `second`, and the shares of good and of bad estimates refused.
 
-    Each number refuses a quarter of the 2 % of good estimates that may be refused; a bad one is off by
-    2 cm or 20 degrees. Only objects that a sentence identifies, or that stand alone, count.
+    Each number of `sure` refuses a quarter of the 2 % of good estimates that it may refuse, each of
+    `second` as many; a bad one is off by 2 cm or 20 degrees. Only objects that a sentence identifies, or
+    that stand alone, count.
     """
-    sure, good = [], []
+    sure, good, second, named = [], [], [], []
     for rows, target, words in _targets(placements):
         found, true = _look(estimator, placements, rows, words), placements.start[rows, target]
         sure.append(found.sureness)
+        second.append(found.second[:, 0])
+        named.append(words.any(1))
         off = (found.start - true)[:, :2].norm(dim=1)
         good.append((off < _BAD[0]) & (_yaw_error(found.start, true) < _BAD[1]))
     shares, fine = torch.cat(sure), torch.cat(good)
-    if not fine.any():  # without a good estimate there is no threshold
-        return (0.0, 0.0, 0.0, 0.0), {"good": 0.0, "bad": 0.0}
+    others, said = torch.cat(second), torch.cat(named)
+    if not (fine & said).any() or not (fine & ~said).any():  # without good estimates, no threshold
+        return estimator.config, {"good": 0.0, "bad": 0.0}
     least = shares[fine].quantile(_FALSE_REFUSALS / shares.shape[1], dim=0)
-    refused = (shares < least).any(1).float()
-    known = {"good": refused[fine].mean().item(), "bad": refused[~fine].sum().item()}
-    known["bad"] /= max(int((~fine).sum()), 1)
-    return (*least.tolist(),), known  # pyright: ignore[reportReturnType]
+    most = [others[fine & (said == s)].quantile(1 - _FALSE_REFUSALS) for s in (False, True)]
+    refused = (shares < least).any(1) | (others > torch.stack(most)[said.long()])
+    known = {"good": refused[fine].float().mean().item()}
+    known["bad"] = refused[~fine].sum().item() / max(int((~fine).sum()), 1)
+    trusted = {"sure": (*least.tolist(),), "second": (*torch.stack(most).tolist(),)}
+    return replace(estimator.config, **trusted), known
 
 
 @torch.no_grad()

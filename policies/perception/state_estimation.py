@@ -111,7 +111,7 @@ class StateEstimator:
                     f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): put "
                     "objects and disc in view, and say which one is meant (--target)"
                 )
-        if look.second[0, 0] > self.pose_estimator.config.second:
+        if look.second[0, 0] > self.pose_estimator.config.second[bool(self.target)]:
             meant = f"'{self.target}'" if self.target else "what is meant"
             raise RefusedError(
                 f"several objects may be {meant}: say which one, so that it fits no other (--target)"
