@@ -56,7 +56,7 @@ def cover_table(spec: mujoco.MjSpec, rng: np.random.Generator) -> None:
         nchannel=3,
     )
     texture.data = pattern.tobytes()
-    repeated = rng.integers(*_REPEATED, 2, endpoint=True).astype(float)
+    repeated = rng.integers(*_REPEATED, 2, endpoint=True).tolist()
     material = spec.add_material(name="cover", texrepeat=repeated)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "cover"
     table = spec.geom("table")
