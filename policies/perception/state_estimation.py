@@ -31,12 +31,13 @@ _FARTHEST = 4.0  # standard deviations of the hand's start in training
 _APART = 0.04
 _PLACES = [0, 1, 5, 6]  # x and y of the object and of the goal in `features.TRUTH_START`
 _OBJECT = 5  # numbers of `features.TRUTH_START` on the object
-_ASKED = (
-    "where the object is",
-    "where the disc is",
-    "how the object is turned",
-    "which side of the image is left",
-)
+_SHOW = "put objects and disc in view, and say which one is meant (--target)"
+_ASKED = {  # and what to do
+    "where the object is": _SHOW,
+    "where the disc is": _SHOW,
+    "how the object is turned": _SHOW,
+    "which side is left": "it may be mirrored: let the camera send images as they are",
+}
 # m. The object has moved if two later estimates agree within the first distance and lie the second
 # one away from the known place. A hand nearer than the third distance hides too much.
 _AGREE, _MOVED, _NEAREST = 0.006, 0.014, 0.04
@@ -105,11 +106,11 @@ class StateEstimator:
         shift = torch.zeros(1, 3) if view is None else torch.from_numpy(view.shift[None]).float()
         self._scene = self.pose_estimator.scene(images, tcp, shift)
         look = self.pose_estimator.look(images, self._words, self._scene)
-        for what, sure, least in zip(_ASKED, look.sureness[0].tolist(), self._least, strict=True):
+        sureness = look.sureness[0].tolist()
+        for (what, remedy), sure, least in zip(_ASKED.items(), sureness, self._least, strict=True):
             if sure < least:
                 raise RefusedError(
-                    f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): put "
-                    "objects and disc in view, and say which one is meant (--target)"
+                    f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): {remedy}"
                 )
         if look.second[0, 0] > self.pose_estimator.config.second[bool(self.target)]:
             meant = f"'{self.target}'" if self.target else "what is meant"
