@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from benchmarks.deployment.deployed_episode import Scene, deploy, deployed_twin
+from benchmarks.deployment.deployed_episode import REFUSED, Scene, deploy, deployed_twin
 from benchmarks.deployment.own_task import OBJECT, TASK, demonstrate, touchgoal
 from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.cell_file import read_cell_file
@@ -30,6 +30,7 @@ from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.training.improve import Improvement
 from touchgoal.rewards.judging.judge import JUDGE
 from touchgoal.runtime import seeds
+from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.json_file import parse_json, write_json
 from touchgoal.runtime.option_types import Count, Positive, checked_dataclass
 
@@ -82,7 +83,9 @@ class _Lab:
         with self.twin() as cell:
             for seed in seeds_:
                 scene = Scene("pick-place", seed, OBJECT)
-                deploy(cell, scene, str(policy), "lock-step", self.config.seconds, out, TASK)
+                run = deploy(cell, scene, str(policy), "lock-step", self.config.seconds, out, TASK)
+                if run.ending.startswith(REFUSED):
+                    raise UserError(run.ending)
                 yield bool(ask_twin(read_cell_file(cell).task.twin, "truth")["success"])
 
     def record(self, policy: Path, root: Path, numbers: range) -> None:
