@@ -30,6 +30,7 @@ _FARTHEST = 4.0  # standard deviations of the hand's start in training
 # error is 16 mm.
 _APART = 0.04
 _PLACES = [0, 1, 5, 6]  # x and y of the object and of the goal in `features.TRUTH_START`
+_YAW = slice(3, 5)  # cosine and sine of twice the grasp's yaw
 _OBJECT = 5  # numbers of `features.TRUTH_START` on the object
 _SHOW = "put objects and disc in view, and say which one is meant (--target)"
 _ASKED = {  # and what to do
@@ -117,7 +118,7 @@ class StateEstimator:
             raise RefusedError(
                 f"several objects may be {meant}: say which one, so that it fits no other (--target)"
             )
-        self._start = self._latest = look.start[0].numpy().copy()
+        self._start = self._latest = _pose(look)
         self._check_camera(look, first)
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
         self._first, self._touched = first, False
@@ -133,11 +134,12 @@ class StateEstimator:
             sure < least for sure, least in zip(look.sureness[0].tolist(), self._least, strict=True)
         ):
             return
-        now, before = look.start[0].numpy().copy(), self._latest
+        now, before = _pose(look), self._latest
         self._latest = now
         moved = np.linalg.norm(now[:2] - self._start[:2]) > _MOVED
         if moved and np.linalg.norm(now[:2] - before[:2]) < _AGREE:
-            self._start = np.concatenate([(now + before)[:_OBJECT] / 2, self._start[_OBJECT:]])
+            object_ = _unit_yaw((now + before) / 2)[:_OBJECT]
+            self._start = np.concatenate([object_, self._start[_OBJECT:]])
 
     def _projected(self, view: UsualView, look: Look) -> Float32[np.ndarray, "4"]:
         """Return places of object and goal, x and y (m), by where they are in the image."""
@@ -190,6 +192,17 @@ class StateEstimator:
                 )
             images[key] = torch.from_numpy(image)[None]
         return evenly_lit(images)
+
+
+def _pose(look: Look) -> Float32[np.ndarray, "7"]:
+    """Return `features.TRUTH_START` as a policy knows it, with a yaw of length 1."""
+    return _unit_yaw(look.start[0].numpy())
+
+
+def _unit_yaw(start: Float32[np.ndarray, "7"]) -> Float32[np.ndarray, "7"]:
+    unit = start.copy()
+    unit[_YAW] /= max(float(np.linalg.norm(unit[_YAW])), 1e-6)
+    return unit
 
 
 def load_pose_estimator(directory: Path) -> PoseEstimator:
