@@ -43,9 +43,7 @@ class Variety:
     covered: float = 0.4  # scenes whose table has a pattern
     repainted: float = 0.5  # placements with table and disc of any colour, and a disc of any size
     elsewhere: float = 0.4  # placements seen by a calibrated camera that stands elsewhere
-    changed: float = (
-        0.7  # others with a camera turned and moved a little, and all with another light
-    )
+    changed: float = 0.7  # others with the camera moved a little; with another light, as all these
     hand_anywhere: float = 0.2  # placements with the hand anywhere over the table
     hand_over: float = 0.3  # placements with it over an object, as when an episode looks again
 

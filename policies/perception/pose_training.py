@@ -77,7 +77,9 @@ def train_pose_estimator(
         identity={
             "train": asdict(config),
             "pose_estimator": asdict(estimator.config),
-            "data": checksum(*tensors, placements.tcp, placements.shift, placements.start),
+            "data": checksum(
+                *tensors, placements.tcp, placements.shift, placements.start, placements.sentence
+            ),
         },
         progress=lambda m: f"pose: loss {m['pose']:.4f}, first look {m['find']:.3f}",
     )
