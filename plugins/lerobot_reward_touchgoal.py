@@ -27,6 +27,7 @@ from torch import Tensor
 from touchgoal.control.features import CONTROL_HZ
 from touchgoal.episodes.schema import Episode
 from touchgoal.rewards.curves import FUSED
+from touchgoal.rewards.distance.normalizer import NORMALIZER, DistanceNormalizer
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.judging.judge import SHIPPED_JUDGE, find_judge
 from touchgoal.rewards.online import CostMeter
@@ -34,7 +35,7 @@ from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.reward import Reward
 
 __all__ = ["TouchgoalConfig", "TouchgoalRewardModel", "make_touchgoal_pre_post_processors"]
-_FILES = "judge.json", "goal.npz", "normalizer.json", "value.json", "value.safetensors"
+_FILES = "judge.json", "goal.npz", NORMALIZER, "value.json", "value.safetensors"
 _CARD = """---
 library_name: lerobot
 pipeline_tag: robotics
@@ -58,10 +59,8 @@ class TouchgoalConfig(RewardModelConfig):
     """Folder of `touchgoal fit-normalizer --judge`, or the name of an encoder that ships with one."""
     sensor: str = "gelsight_mini"
     """Fingertip sensor."""
-    scene: str = "simulated pick-place"
-    """Scene that the judge was fitted on; "real" for episodes of one's own."""
     task: str = ""
-    """Task in words, as in the episodes that the judge was fitted on."""
+    """Task in words, as in the episodes that the judge was fitted on; simulated ones need none."""
     object: str = ""
     """Object of the runs, which chooses among the goals; "" if unknown."""
     fps: float = CONTROL_HZ
@@ -125,7 +124,8 @@ class TouchgoalRewardModel(PreTrainedRewardModel):
     def _prepare(self, frames: dict[str, np.ndarray]) -> PreparedReward:
         if self._prepared is None:
             config = cast(TouchgoalConfig, self.config)
-            about = {"sensor": config.sensor, "scene": config.scene, "task": config.task}
+            scene = DistanceNormalizer.load(self._folder / NORMALIZER).scene
+            about = {"sensor": config.sensor, "scene": scene, "task": config.task}
             self._prepared = self._reward.prepare(Inputs.of("the batch", frames, **about))
         return self._prepared
 
@@ -184,7 +184,8 @@ def main() -> None:
     parser.add_argument("--judge", default=SHIPPED_JUDGE, help="See TouchgoalConfig.judge.")
     options = parser.parse_args()
     dataset = LeRobotDataset(options.repo_id, root=options.root)
-    model = make_reward_model(TouchgoalConfig(judge=options.judge, fps=dataset.fps))
+    about = {"task": dataset[0]["task"], "fps": dataset.fps}
+    model = make_reward_model(TouchgoalConfig(judge=options.judge, **about))
     print(label(model, dataset))
 
 
