@@ -21,7 +21,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.deploy import NOT_DONE, Config, main
 from touchgoal.launch.support import cell_run
 from touchgoal.policies import checkpoint
-from touchgoal.policies.perception.state_estimation import load_pose_estimator
+from touchgoal.policies.perception.state_estimation import StateEstimator, load_pose_estimator
 from touchgoal.runtime.errors import RefusedError
 
 blank = {key: np.zeros(kind.shape, kind.dtype) for key, kind in ft.FEATURES.items()}
@@ -39,9 +39,10 @@ for name in ("bead-maze", "pick-place"):
         with suppress(RefusedError):
             sys.exit(f"acts on a black image: {policy.act(seen)}")
         policy.reset()
-        eyes = policy._estimator.pose_estimator
+        estimator = getattr(policy, "_estimator", None)
+        assert isinstance(estimator, StateEstimator)
+        eyes, estimator._least = estimator.pose_estimator, (0.0,) * 4
         eyes.config = replace(eyes.config, second=(1.0, 1.0))
-        policy._estimator._least = (0.0,) * 4
     assert policy.act(seen).shape == (8,)
 
 CELL = """
