@@ -5,6 +5,7 @@ front camera is turned and moved, and the light changed, in most of them; the ha
 """
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from touchgoal.encoders.training.options import TrainerOptions
@@ -39,7 +40,7 @@ def main(config: Config) -> None:
     from touchgoal.encoders.training.run import check_run, open_training
     from touchgoal.encoders.training.trainer import is_first_process
     from touchgoal.policies.perception import pose_training
-    from touchgoal.policies.perception.placements import Variety, render_placements
+    from touchgoal.policies.perception.placements import NO_VARIETY, Variety, render_placements
     from touchgoal.policies.perception.pose_estimator import PoseEstimator
     from touchgoal.policies.perception.state_estimation import ESTIMATOR_FORMAT
     from touchgoal.runtime import seeds
@@ -62,19 +63,18 @@ def main(config: Config) -> None:
     pose_training.train_pose_estimator(network, rendered, config.train, out, config, known)
     if not is_first_process():
         return
-    few = max(1, config.scenes // 8)
-    first = seeds.POSE_VALIDATION.start
+    few, first = max(1, config.scenes // 8), seeds.POSE_VALIDATION.start
     varied = Variety(hand_anywhere=0, hand_over=0)
     others = render_placements(env, few, 10, first + few, config.workers, varied)
     network.config, refused = pose_training.fit_trust(network, others)
     print(f"refused: {refused['good']:.1%} of good estimates, {refused['bad']:.0%} of bad ones")
     errors = {}
     for where, variety in (
-        ("as usual", Variety(0, 0, 0, 0, 0, 0, 0)),
-        ("camera and light changed", Variety(0, 0, 0, 0, 1, 0, 0)),
-        ("calibrated camera elsewhere", Variety(0, 0, 0, 1, 1, 0, 0)),
-        ("table and disc of another look", Variety(0, 0.5, 1, 0, 0, 0, 0)),
-        ("hand over an object", Variety(0, 0, 0, 0, 0, 0, 1)),
+        ("as usual", NO_VARIETY),
+        ("camera and light changed", replace(NO_VARIETY, changed=1)),
+        ("calibrated camera elsewhere", replace(NO_VARIETY, elsewhere=1)),
+        ("table and disc of another look", replace(NO_VARIETY, covered=0.5, repainted=1)),
+        ("hand over an object", replace(NO_VARIETY, hand_over=1)),
     ):
         others = render_placements(env, few, 10, first, config.workers, variety)
         errors[where] = pose_training.pose_errors(network, others)

@@ -1,6 +1,6 @@
 """Rendered starts of pick-place, on which the pose estimator is trained."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import chain
 from typing import Any
@@ -46,6 +46,9 @@ class Variety:
     changed: float = 0.7  # others with the camera moved a little; with another light, as all these
     hand_anywhere: float = 0.2  # placements with the hand anywhere over the table
     hand_over: float = 0.3  # placements with it over an object, as when an episode looks again
+
+
+NO_VARIETY = Variety(*[0.0] * len(fields(Variety)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +140,8 @@ def _render_scene(
         changed = elsewhere or rng.random() < variety.changed
         light.change(env.model, draw_lighting(rng) if changed else USUAL)
         near = draw_near_placement(camera, rng) if changed else camera
-        place_camera(env.model, draw_placement(camera, WORKSPACE, rng) if elsewhere else near)
+        placement = draw_placement(camera, WORKSPACE, rng) if elsewhere else near
+        place_camera(env.model.camera("front"), placement)
         for look, before in zip(looks, usual, strict=True):
             look[:] = before
         if rng.random() < variety.repainted:

@@ -16,6 +16,7 @@ from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.config import MAX_CAMERA_SIDE, SceneConfig
 from touchgoal.sim_envs.scene.objects import FIRM, Body
+from touchgoal.sim_envs.scene.variety import place_camera
 
 SIDES = ("left", "right")
 OBJECT_GROUP, VISUAL_GROUP, HIDDEN_GROUP = 1, 2, 3
@@ -46,10 +47,7 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
     _add_cameras_and_table(spec, ROBOTS[config.arm].tool)
     for name, placement in (("front", config.front_camera), ("wrist", config.wrist_camera)):
         if placement is not None:
-            camera, (*pos, w, x, y, z, fovy) = spec.camera(name), placement
-            camera.pos, camera.fovy = np.array(pos), fovy
-            # Half a turn about x: MuJoCo's cameras look along -z and have y up.
-            camera.quat = np.array([-x, w, z, -y])
+            place_camera(spec.camera(name), placement)
     for body in bodies:
         add_body(spec, body)
     return spec

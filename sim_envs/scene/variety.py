@@ -110,14 +110,12 @@ def draw_placement(
             return camera
 
 
-def place_camera(model: Any, placement: CameraPlacement) -> None:
-    """Put the front camera there."""
-    camera = model.camera("front")
-    camera.pos[:] = placement[:3]
-    facing = Rotation.from_quat(placement[3:7], scalar_first=True)
+def place_camera(camera: Any, placement: CameraPlacement) -> None:
+    """Put a camera of an MjSpec or MjModel there."""
+    *pos, w, x, y, z, fovy = placement
+    camera.pos, camera.fovy = np.array(pos), fovy
     # Half a turn about x: MuJoCo's cameras look along -z and have y up.
-    camera.quat[:] = (facing * Rotation.from_euler("x", np.pi)).as_quat(scalar_first=True)
-    camera.fovy[:] = placement[7]
+    camera.quat = np.array([-x, w, z, -y])
 
 
 def measured_placement(
