@@ -27,11 +27,6 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import on_interruption
 from touchgoal.runtime.provenance import command_line
 
-try:
-    from torch.distributed._functional_collectives import all_gather_single
-except ImportError:  # its name in torch 2.11, which lerobot pins
-    from torch.distributed._functional_collectives import all_gather_tensor as all_gather_single
-
 Metrics = dict[str, Any]  # numbers by name; None where one is undefined
 
 
@@ -252,8 +247,23 @@ def epoch_batches(
 
 def gather_batch(rows: Shaped[Tensor, "b ..."]) -> Shaped[Tensor, "n ..."]:
     """Return the rows of all processes, in order and with gradients, for losses between samples."""
-    group = torch.distributed.group.WORLD if torch.distributed.is_initialized() else None
-    return rows if group is None else all_gather_single(rows.contiguous(), 0, group)
+    return _AllRows.apply(rows.contiguous()) if torch.distributed.is_initialized() else rows
+
+
+class _AllRows(torch.autograd.Function):
+    """Gather rows; the functional collectives of torch 2.13 overwrite foreign memory over gloo."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor) -> Tensor:
+        parts = [torch.empty_like(rows) for _ in range(torch.distributed.get_world_size())]
+        torch.distributed.all_gather(parts, rows)
+        return torch.cat(parts)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        summed = gradient.clone(memory_format=torch.contiguous_format)
+        torch.distributed.all_reduce(summed)
+        return own_rows(summed, len(summed) // torch.distributed.get_world_size())
 
 
 def own_rows(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "{count} ..."]:
