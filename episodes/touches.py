@@ -218,11 +218,6 @@ class ContactStream:
         return np.array([self._detector.update(frame) for frame in frames], bool)
 
 
-def contact_per_frame(frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, " t"]:
-    """Detect contact in each frame of a fingertip; the first 5 must be without."""
-    return ContactStream().update(frames)
-
-
 def _background(episodes: EpisodeSet, i: int, side: int) -> UInt8[np.ndarray, "h w 3"]:
     key = TACTILE[side]
     first = range(min(SETTLES_WITHIN, episodes.lengths[i]))
@@ -234,7 +229,7 @@ def _contact(episodes: EpisodeSet, i: int, sides: list[int]) -> Bool[np.ndarray,
         return episodes.read(i, [TRUTH_CONTACT]).frames[TRUTH_CONTACT][:, sides]
     keys = [TACTILE[side] for side in sides]
     frames = episodes.read(i, keys).frames
-    return np.stack([contact_per_frame(frames[key]) for key in keys], axis=1)
+    return np.stack([ContactStream().update(frames[key]) for key in keys], axis=1)
 
 
 def _sample_frames(

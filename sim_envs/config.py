@@ -204,7 +204,8 @@ class EnvConfig(SceneConfig):
 
     def __post_init__(self) -> None:
         """Raise ValueError if a tick is no whole number of set-points, or an episode has none."""
-        if not _is_multiple(1 / self.control_hz, SETPOINT_PERIOD):
+        setpoints = 1 / self.control_hz / SETPOINT_PERIOD
+        if round(setpoints) < 1 or abs(setpoints - round(setpoints)) >= 1e-6:
             raise ValueError(
                 f"control_hz is {self.control_hz}; it must divide 500 (10, 20, 25, 50, 100, ...), "
                 "because set-points come every 2 ms"
@@ -337,10 +338,6 @@ class FragileCarryReset:
     """Force of each finger that just holds the rod, N."""
     mass: Mass | None = None
     """Mass of the rod, kg."""
-
-
-def _is_multiple(value: float, of: float) -> bool:
-    return value / of >= 0.999 and abs(value / of - round(value / of)) < 1e-6
 
 
 TaskConfig = PickPlaceConfig | BeadMazeConfig | FragileCarryConfig

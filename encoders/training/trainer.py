@@ -10,6 +10,7 @@ import math
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -165,9 +166,8 @@ def fit(
                 training.after_epoch(history, provenance)
                 if record:
                     record.write(history, state)
-                    line = training.progress(history[-1])
-                    tqdm.write(f"epoch {epoch + 1}/{config.epochs}  {line}")
-                _wait_for_everyone()
+                line = f"epoch {epoch + 1}/{config.epochs}  {training.progress(history[-1])}"
+                on_first_process(partial(tqdm.write, line))
     finally:
         if record:
             record.close()
@@ -276,12 +276,7 @@ def on_first_process(action: Callable[[], object]) -> None:
     """Run `action` in the first of several processes, while the others wait."""
     if is_first_process():
         action()
-    _wait_for_everyone()
-
-
-def _wait_for_everyone() -> None:
-    """Wait for all processes; Accelerate's own wait wants a GPU for each, even of a training on CPUs."""
-    if torch.distributed.is_initialized():
+    if torch.distributed.is_initialized():  # Accelerate's own wait wants a GPU for each process
         torch.distributed.barrier()
 
 
