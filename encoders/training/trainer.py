@@ -260,8 +260,8 @@ class _AllRows(torch.autograd.Function):
         return torch.cat(parts)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        summed = gradient.clone(memory_format=torch.contiguous_format)
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:
+        summed = grad_outputs[0].clone(memory_format=torch.contiguous_format)
         torch.distributed.all_reduce(summed)
         return own_rows(summed, len(summed) // torch.distributed.get_world_size())
 
