@@ -41,10 +41,7 @@ BENCHMARKS = {
         "papers.reward_judge",
         "success told from failure in runs of other hands than the fitted one",
     ),
-    "reward-use": (
-        "papers.reward_use",
-        "learning from the demonstrations that a reward accepts",
-    ),
+    "reward-use": ("papers.reward_use", "learning from the demonstrations that a reward accepts"),
     "improve": ("papers.improve", "a policy improved by its own runs, by what accepts them"),
     "grasp-search": ("papers.grasp_search", "grasps found by trial on the cost"),
     "grip-search": ("papers.grip_search", "grip force found by trial where a crush is not seen"),

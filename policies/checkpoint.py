@@ -67,16 +67,19 @@ class SavedPolicy:
     target: str = ""
     front_camera: CameraPlacement | None = None
 
-    def __call__(self, env: Any = None) -> LearnedPolicy:
-        """Return the policy at an episode's beginning; its plans come as late as `env` says."""
-        network, touch, pose_estimator = _load_parts(self.directory, _stamp(self.directory))
+    def __call__(self, env: Any = None, network: PolicyNetwork | None = None) -> LearnedPolicy:
+        """Return the policy, or another network in its place, at an episode's beginning.
+
+        Its plans come as late as `env` says.
+        """
+        own, touch, pose_estimator = _load_parts(self.directory, _stamp(self.directory))
         target = self.target
         if env and EPISODE_OBJECT in target:
             target = target.replace(EPISODE_OBJECT, env.asked_name)
         camera = self.front_camera if env is None else env.calibrated_camera()
         estimator = StateEstimator(pose_estimator, target, camera) if pose_estimator else None
         plan_ticks = max(self.plan_ticks, env.plan_ticks if env else 0)
-        return LearnedPolicy(network, touch, estimator, plan_ticks, self.directory)
+        return LearnedPolicy(network or own, touch, estimator, plan_ticks, self.directory)
 
     @property
     def is_estimated(self) -> bool:

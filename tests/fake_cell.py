@@ -9,14 +9,7 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import ControlLoop, Ending
-from touchgoal.control.interfaces import (
-    Actor,
-    ArmReading,
-    Cost,
-    Frame,
-    GripperReading,
-    LoadReading,
-)
+from touchgoal.control.interfaces import Actor, ArmReading, Cost, Frame, GripperReading, LoadReading
 from touchgoal.control.run_log import RunLog
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3

@@ -235,10 +235,7 @@ def test_moves_over_the_table_are_free_and_one_into_the_arm_itself_is_not() -> N
         (0.5, "tool 0.5 mm from where the controller has it"),
         (1.5, "tool 1.5 mm .*; the arm's own calibration is not used"),
         (9.5, "tool 9.5 mm .*; the arm's own calibration is not used"),
-        (
-            10.5,
-            "tool 10.5 mm .*: is it no FR3[?] set the cell file's arm",
-        ),
+        (10.5, "tool 10.5 mm .*: is it no FR3[?] set the cell file's arm"),
     ],
 )
 def test_the_preflight_names_kinematics_that_differ_from_the_controllers(

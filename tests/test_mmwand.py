@@ -12,10 +12,7 @@ from in_process import in_process_workers, run_benchmark
 
 from benchmarks.papers.mmwand.real import zero_shot
 from benchmarks.papers.mmwand.splits import SPLITS, split_touches
-from benchmarks.published_touch.objectfolder_real import (
-    read_objectfolder_real,
-    read_touches,
-)
+from benchmarks.published_touch.objectfolder_real import read_objectfolder_real, read_touches
 from benchmarks.published_touch.tvl import read_tvl
 from touchgoal.control import features as ft
 from touchgoal.encoders.alignment.words import surface_ranks

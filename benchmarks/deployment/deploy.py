@@ -16,12 +16,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from benchmarks.deployment.deployed_episode import (
-    Deployment,
-    Scene,
-    deploy,
-    deployed_twin,
-)
+from benchmarks.deployment.deployed_episode import Deployment, Scene, deploy, deployed_twin
 from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import SimulatedTask

@@ -24,11 +24,7 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.config import (
-    USUAL_CAMERA,
-    PickPlaceConfig,
-    SceneConfig,
-)
+from touchgoal.sim_envs.config import USUAL_CAMERA, PickPlaceConfig, SceneConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.lighting import Lighting
 from touchgoal.sim_envs.scene.variety import moved_camera

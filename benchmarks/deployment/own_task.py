@@ -12,13 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from benchmarks.deployment.deployed_episode import (
-    REFUSED,
-    Deployment,
-    Scene,
-    deploy,
-    deployed_twin,
-)
+from benchmarks.deployment.deployed_episode import REFUSED, Deployment, Scene, deploy, deployed_twin
 from benchmarks.options import BenchmarkOptions
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.twin_client import ask_twin

@@ -14,12 +14,7 @@ from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy
 from touchgoal.policies.evaluation.evaluate import GAVE_UP, REFUSED, Evaluation, evaluate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
-from touchgoal.sim_envs.config import (
-    ENVS,
-    BeadMazeConfig,
-    PickPlaceConfig,
-    TaskConfig,
-)
+from touchgoal.sim_envs.config import ENVS, BeadMazeConfig, PickPlaceConfig, TaskConfig
 
 UNCHANGED = "unchanged"  # row of a table
 TABLE_HEAD = f"{'':<46}{'success [95 % Wilson]':<24}{'peak force N, mean':>19}{'sd':>6}{'max':>6}"

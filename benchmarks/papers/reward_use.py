@@ -21,11 +21,7 @@ from benchmarks.papers.reward_quality.recording import Recorded, Sizes, plan, re
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
-from touchgoal.policies.checkpoint import (
-    ESTIMATOR,
-    SHIPPED_POLICIES,
-    SavedPolicy,
-)
+from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.evaluation.evaluate import Trial, run_trials, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
@@ -48,11 +44,7 @@ _TASK = PickPlaceConfig(objects=HELD_OUT_OBJECTS)
 _ACCEPTED = "accepted by "
 _KEPT = 0.8  # share of right ones that a limit accepts
 Weights = Literal[
-    "none",
-    "successes alone",
-    "accepted by judge",
-    "accepted by image",
-    "accepted by tactile",
+    "none", "successes alone", "accepted by judge", "accepted by image", "accepted by tactile"
 ]
 """Weights of the demonstrations: none; 1 for successes, else 0; 1 where the end is no dearer than four of five
 right ones, else 0."""

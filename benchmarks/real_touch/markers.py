@@ -9,11 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.options import BenchmarkOptions
-from benchmarks.published_touch.marker_images import (
-    MarkerImage,
-    has_markers,
-    read_marker_images,
-)
+from benchmarks.published_touch.marker_images import MarkerImage, has_markers, read_marker_images
 from touchgoal.control.tactile.markers.tracker import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, MarkerGrid
 from touchgoal.runtime.errors import UserError

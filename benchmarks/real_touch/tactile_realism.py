@@ -15,12 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from benchmarks.options import BenchmarkOptions
-from benchmarks.real_touch.taxim_peer import (
-    PIXEL_PITCH,
-    TaximRenderer,
-    has_jax,
-    real_presses,
-)
+from benchmarks.real_touch.taxim_peer import PIXEL_PITCH, TaximRenderer, has_jax, real_presses
 from touchgoal.control.calibration.calibrate import FittedCalibration, fit
 from touchgoal.control.calibration.press_fit import REGION
 from touchgoal.control.calibration.press_set import PressSet, split, write_presses

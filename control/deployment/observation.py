@@ -9,13 +9,7 @@ from jaxtyping import Float, UInt8
 from touchgoal.control import features as ft
 from touchgoal.control.arrays import Image
 from touchgoal.control.cell.connection import CellConnection
-from touchgoal.control.interfaces import (
-    ArmReading,
-    DriverError,
-    Frame,
-    GripperReading,
-    LoadReading,
-)
+from touchgoal.control.interfaces import ArmReading, DriverError, Frame, GripperReading, LoadReading
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.fingertip_health import FingertipHealth, image_fault

@@ -140,8 +140,7 @@ def image_files(folder: Path) -> list[Path]:
 def in_natural_order(paths: Iterable[Path]) -> list[Path]:
     """Sort paths, numbers in them by value: 2 before 10."""
     return sorted(
-        paths,
-        key=lambda path: [(t, int(n or 0)) for t, n in re.findall(r"(\D*)(\d*)", str(path))],
+        paths, key=lambda path: [(t, int(n or 0)) for t, n in re.findall(r"(\D*)(\d*)", str(path))]
     )
 
 

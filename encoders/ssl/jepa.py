@@ -154,10 +154,7 @@ class VJepa(JointEmbeddingPrediction):
         grid, times = patch_grid(vit), vit.frames // vit.tubelet
         everything = torch.ones(count, grid[0] * grid[1], dtype=torch.bool)
         drawn: dict[str, list[Tensor]] = {"context_ids": [], "target_ids": []}
-        for scale, blocks in (
-            (_SMALL_SCALE, config.small_blocks),
-            (_LARGE_SCALE, _LARGE_BLOCKS),
-        ):
+        for scale, blocks in ((_SMALL_SCALE, config.small_blocks), (_LARGE_SCALE, _LARGE_BLOCKS)):
             size = masks.draw_size(grid, (scale, scale), ASPECT, generator)
             hidden, left = masks.draw_targets(grid, size, count, blocks, everything, 1, generator)
             target = masks.draw_equal_counts(

@@ -22,7 +22,7 @@ from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNet
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
-_BETAS, _WEIGHT_DECAY = (0.95, 0.999), 1e-6  # of AdamW, as in diffusion_policy
+BETAS, WEIGHT_DECAY = (0.95, 0.999), 1e-6  # of AdamW, as in diffusion_policy
 _SEEN = "touch", "state", "images", "maps"  # of a batch, by the policy as it acts
 _LEARNED = "actions", "noise", "wrench", "action_is_pad", "key_pose"  # and by the loss alone
 _VALIDATION_WINDOWS = 1024  # evenly spaced, for the losses
@@ -51,17 +51,7 @@ def train(
         recipe: JSON-able provenance of the episodes, written beside the weights.
         warmup_steps: in which the learning rate rises; a tenth of the training if that is shorter.
     """
-    recorded = windows.recorded
-    widths = recorded.actions[:, -1].unique().tolist()
-    policy = replace(policy, gripper_widths=tuple(widths) if len(widths) == 2 else ())
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(options.seed)
-        network = PolicyNetwork(policy)
-    network.fit_normalizers(
-        recorded.touch.float(), recorded.state, windows.joints, windows.actions,
-        recorded.wrench, windows.action_is_pad, recorded.maps, recorded.key_pose,
-    )  # fmt: skip
-    network.fit_novelty(recorded.touch.float(), recorded.lengths)
+    network = untrained(policy, windows, options.seed)
     average = AveragedModel(network, multi_avg_fn=_update_average).eval().requires_grad_(False)
     averaged = cast(PolicyNetwork, average.module)
 
@@ -78,23 +68,21 @@ def train(
             on_first_process(partial(checkpoint.save, averaged, folder, provenance | known))
 
     training = Training(
-        loss=_PolicyLoss(network),
+        loss=PolicyLoss(network),
         n_samples=len(windows),
-        batch=lambda rows, noise: (
-            _make_batch(windows, windows.draw(rows, noise)) | {"noise": noise}
-        ),
+        batch=lambda rows, noise: make_batch(windows, windows.draw(rows, noise)) | {"noise": noise},
         optimizer=OptimizerConfig(
             config.epochs,
             config.batch_size,
             config.lr,
-            _WEIGHT_DECAY,
-            betas=_BETAS,
+            WEIGHT_DECAY,
+            betas=BETAS,
             max_warmup_steps=warmup_steps,
         ),
         identity={
             "train": asdict(config),
             "warmup_steps": warmup_steps,
-            "policy": asdict(policy),
+            "policy": asdict(network.config),
             "data": [_checksum(windows), _checksum(validation)],
         },
         evaluate=lambda: _validate(averaged, validation, options.seed),
@@ -105,6 +93,22 @@ def train(
     )
     fit(training, out_dir, options, recipe)
     return checkpoint.load(out_dir / POLICY)
+
+
+def untrained(policy: PolicyConfig, windows: SequenceDataset, seed: int) -> PolicyNetwork:
+    """Return a network with random weights, its normalizers and gripper widths fitted to windows."""
+    recorded = windows.recorded
+    widths = recorded.actions[:, -1].unique().tolist()
+    policy = replace(policy, gripper_widths=tuple(widths) if len(widths) == 2 else ())
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = PolicyNetwork(policy)
+    network.fit_normalizers(
+        recorded.touch.float(), recorded.state, windows.joints, windows.actions,
+        recorded.wrench, windows.action_is_pad, recorded.maps, recorded.key_pose,
+    )  # fmt: skip
+    network.fit_novelty(recorded.touch.float(), recorded.lengths)
+    return network
 
 
 def ema_decay(step: int) -> float:
@@ -118,19 +122,21 @@ def _update_average(average: Sequence[Tensor], weights: Sequence[Tensor], n_aver
         mean.lerp_(weight, 1 - ema_decay(int(n_averaged)))
 
 
-class _PolicyLoss(nn.Module):
-    """Training loss of a policy, for the trainer."""
+class PolicyLoss(nn.Module):
+    """Training loss of a policy on what `make_batch` returns, with the `BatchNoise` as "noise"."""
 
     def __init__(self, policy: PolicyNetwork) -> None:
         super().__init__()
         self.policy = policy
 
     def forward(self, **batch: Any) -> dict[str, Tensor]:
+        """Return "loss"."""
         observed = _observed(batch)
         return {"loss": self.policy.loss(observed, **{name: batch[name] for name in _LEARNED})}
 
 
-def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, Any]:
+def make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, Any]:
+    """Return some windows as `PolicyLoss` takes them, but for the noise."""
     observed, actions = windows.take(rows)
     return {
         "touch": observed.touch,
@@ -149,7 +155,7 @@ def _validation_batch(policy: PolicyNetwork, windows: SequenceDataset) -> dict[s
     n = min(_VALIDATION_WINDOWS, len(windows))
     rows = torch.linspace(0, len(windows) - 1, n).long()
     device = policy.action_normalizer.scale.device
-    return cast(dict[str, Any], send_to_device(_make_batch(windows, rows), device))
+    return cast(dict[str, Any], send_to_device(make_batch(windows, rows), device))
 
 
 def _observed(batch: dict[str, Any]) -> ObservationBatch:
@@ -166,7 +172,7 @@ def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dic
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
     error = off.sum(1).norm(dim=1).mean()
-    loss = _PolicyLoss(policy)(**batch, noise=BatchNoise(generator))["loss"]
+    loss = PolicyLoss(policy)(**batch, noise=BatchNoise(generator))["loss"]
     metrics = {"validation_loss": loss.item(), "validation_error": error.item()}
     if batch["key_pose"] is not None:
         off = policy.key_pose_error(observed, batch["key_pose"])

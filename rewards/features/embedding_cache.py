@@ -13,12 +13,7 @@ from touchgoal.episodes.embedding_files import embedding_file
 from touchgoal.episodes.schema import Episode, is_camera
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
-from touchgoal.rewards.features.embedded import (
-    TOUCH,
-    EmbeddedEpisode,
-    load_features,
-    save_features,
-)
+from touchgoal.rewards.features.embedded import TOUCH, EmbeddedEpisode, load_features, save_features
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.judging.end_state import put_down
 from touchgoal.rewards.metrics import START_FRAMES

@@ -46,10 +46,7 @@ def write_report(
 
 
 def report_all(
-    records: Sequence[Path],
-    out: Path,
-    provenance: Mapping[str, Any],
-    audit: str = "",
+    records: Sequence[Path], out: Path, provenance: Mapping[str, Any], audit: str = ""
 ) -> str:
     """Write the reports of all records: metrics, tables for LeRobot, pages; print the tables.
 

@@ -64,11 +64,7 @@ class VideoTrajectory(Trajectory):
 
 
 def open_videos(
-    path: Path,
-    camera: str,
-    with_touch: bool,
-    fps: float | None,
-    background: Sequence[Path] = (),
+    path: Path, camera: str, with_touch: bool, fps: float | None, background: Sequence[Path] = ()
 ) -> Source:
     """Open a video file, a folder of images, or a folder that holds several of them.
 

@@ -218,10 +218,7 @@ class TactilePad:
         return placed
 
     def _pose(
-        self,
-        data: mujoco.MjData,
-        position: Float[np.ndarray, "3"],
-        matrix: Float[np.ndarray, "9"],
+        self, data: mujoco.MjData, position: Float[np.ndarray, "3"], matrix: Float[np.ndarray, "9"]
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
         R = data.site_xmat[self._site].reshape(3, 3)
         return (position - data.site_xpos[self._site]) @ R, R.T @ matrix.reshape(3, 3)

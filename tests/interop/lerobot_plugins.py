@@ -1,5 +1,5 @@
-"""touchgoal's policy in touchgoal's environment by lerobot-eval, against touchgoal's own loop; its reward, a
-twin's arm and a fingertip through lerobot's interfaces.
+"""touchgoal's policy by lerobot-eval and lerobot-train, against touchgoal's own loops; its reward, a twin's arm
+and a fingertip through lerobot's interfaces.
 
     python tests/interop/lerobot_plugins.py PYTHON      PYTHON: of an environment with lerobot
 
@@ -17,11 +17,20 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 import numpy as np  # noqa: E402
+import torch  # noqa: E402
 from running_twin import RunningTwin  # noqa: E402
 
 import touchgoal  # noqa: E402
 from touchgoal.control.features import TRUTH_SUCCESS  # noqa: E402
+from touchgoal.encoders.training.batch_noise import BatchNoise  # noqa: E402
+from touchgoal.episodes.store import EpisodeSet  # noqa: E402
 from touchgoal.policies.acting import LearnedPolicy  # noqa: E402
+from touchgoal.policies.checkpoint import SavedPolicy  # noqa: E402
+from touchgoal.policies.training.sequence_dataset import (  # noqa: E402
+    SequenceDataset,
+    load_recordings,
+)
+from touchgoal.policies.training.train import PolicyLoss, make_batch  # noqa: E402
 
 ROOT = HERE.parents[1]
 TWIN = ["--lock-step", "--env.objects", "wooden_block", "--env.cameras", "front"]
@@ -36,15 +45,36 @@ def run_with_plugins(folder: Path, *command: str | Path) -> str:
     return done.stdout
 
 
-def record_with_costs(folder: Path) -> list[tuple[Path, Path]]:
-    """Record an episode by the expert; return its set and a file with its costs by touchgoal."""
+def record(out: Path, *options: str) -> Path:
+    """Record an episode by the expert; return its set."""
     command = [sys.executable, "-m", "touchgoal.launch", "collect-demos", "--episodes", "1"]
-    command += ["--env.objects", "wooden_block", "--out", str(folder / "demo")]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    root, costs = folder / "demo" / "episodes", folder / "costs.npy"
+    subprocess.run([*command, *options, "--out", out], check=True, stdout=subprocess.DEVNULL)
+    return out / "episodes"
+
+
+def costs_of(root: Path) -> Path:
+    """Return a file with the costs of an episode by touchgoal."""
     [curves] = touchgoal.Reward.of_judge("gelsight_mini")(root)
-    np.save(costs, curves.costs["fused"])
-    return [(root, costs)]
+    np.save(root.parent / "costs.npy", curves.costs["fused"])
+    return root.parent / "costs.npy"
+
+
+def train_with_lerobot(python: Path, plugins: Path, folder: Path) -> None:
+    """Train the maze's policy on frozen touch by lerobot-train; its first loss must be touchgoal's."""
+    root, out = record(folder / "maze", "--task", "bead-maze"), folder / "trained"
+    run_with_plugins(plugins, python, HERE / "lerobot_policy.py", root, out)
+    (rows, theirs), *_ = json.loads((out / "steps.json").read_text())
+    episodes, actor = EpisodeSet(root), touchgoal.load_policy("bead-maze")
+    recorded = load_recordings(episodes, [0], actor.config, actor.touch)
+    batch = make_batch(SequenceDataset(recorded, actor.config), torch.tensor(rows))
+    network = SavedPolicy(actor.directory).network()
+    torch.manual_seed(0)
+    own = PolicyLoss(network)(**batch, noise=BatchNoise(torch.default_generator))["loss"].item()
+    print(f"loss of {len(rows)} windows by lerobot-train {theirs:.7f}, by touchgoal {own:.7f}")
+    assert abs(own - theirs) < 1e-5 * own
+    trained = touchgoal.load_policy(out / "checkpoints" / "last" / "pretrained_model")
+    before, after = (SavedPolicy(p.directory).network().state_dict() for p in (actor, trained))
+    assert any(not torch.equal(weight, after[name]) for name, weight in before.items())
 
 
 def evaluate_with_lerobot(python: Path, plugins: Path, out: Path) -> list[tuple[float, bool]]:
@@ -92,8 +122,10 @@ def main() -> None:
         (folder / "twin").mkdir()
         with closing(RunningTwin(TWIN, folder / "twin", 0)) as twin:
             print(run_with_plugins(plugins, python, HERE / "lerobot_arm.py", twin.cell_file))
-        for out in record_with_costs(folder):
-            print(run_with_plugins(plugins, python, HERE / "lerobot_reward.py", *out))
+        root = record(folder / "demo", "--env.objects", "wooden_block")
+        costs = costs_of(root)
+        print(run_with_plugins(plugins, python, HERE / "lerobot_reward.py", root, costs))
+        train_with_lerobot(python, plugins, folder)
         theirs = evaluate_with_lerobot(python, plugins, folder / "eval")
     here = evaluate_here()
     print(f"{'seed':>6}{'lerobot-eval':>14}{'success':>9}{'touchgoal':>11}{'success':>9}")

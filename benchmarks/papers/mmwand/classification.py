@@ -16,20 +16,10 @@ from torch import Tensor
 
 from benchmarks.options import BenchmarkOptions
 from benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
-from benchmarks.papers.mmwand.fine_tuned import (
-    Modality,
-    Network,
-    fine_tune,
-    read_images,
-)
+from benchmarks.papers.mmwand.fine_tuned import Modality, Network, fine_tune, read_images
 from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from benchmarks.papers.mmwand.splits import Fold
-from benchmarks.papers.mmwand.trained import (
-    Trainable,
-    embed_touches,
-    read_touch_data,
-    train,
-)
+from benchmarks.papers.mmwand.trained import Trainable, embed_touches, read_touch_data, train
 from touchgoal.encoders.alignment.config import AlignConfig
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.towers import load_towers

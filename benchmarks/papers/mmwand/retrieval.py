@@ -23,12 +23,7 @@ from benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
 from benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from benchmarks.papers.mmwand.real.captioned_set import embed_captioned
 from benchmarks.papers.mmwand.splits import SPLITS, Fold, Split
-from benchmarks.papers.mmwand.trained import (
-    Trainable,
-    embed_fold,
-    read_touch_data,
-    train,
-)
+from benchmarks.papers.mmwand.trained import Trainable, embed_fold, read_touch_data, train
 from benchmarks.published_touch.tvl import is_tvl
 from touchgoal.encoders.alignment.config import AlignConfig, HeadsConfig
 from touchgoal.encoders.alignment.data import TouchData

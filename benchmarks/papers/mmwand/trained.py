@@ -11,12 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 
 from benchmarks.papers.mmwand.splits import Fold
-from touchgoal.encoders.alignment.align import (
-    AlignmentLoss,
-    find_vit,
-    make_batch,
-    optimizer_config,
-)
+from touchgoal.encoders.alignment.align import AlignmentLoss, find_vit, make_batch, optimizer_config
 from touchgoal.encoders.alignment.config import AlignConfig
 from touchgoal.encoders.alignment.data import TouchData, prepare_touch_data
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig

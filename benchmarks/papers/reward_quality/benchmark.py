@@ -15,10 +15,7 @@ import numpy as np
 from benchmarks.options import CORES, BenchmarkOptions
 from benchmarks.papers.reward_quality import tables
 from benchmarks.papers.reward_quality.claims import judge_claims
-from benchmarks.papers.reward_quality.early_stopping import (
-    judge_stopping,
-    stopping_text,
-)
+from benchmarks.papers.reward_quality.early_stopping import judge_stopping, stopping_text
 from benchmarks.papers.reward_quality.embedding import EmbeddedFiles
 from benchmarks.papers.reward_quality.judging import Judge, fit_judge
 from benchmarks.papers.reward_quality.measures import (

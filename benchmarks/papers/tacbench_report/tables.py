@@ -6,11 +6,7 @@ from typing import Any
 
 from benchmarks.papers.tacbench.config import Config
 from benchmarks.papers.tacbench.probes import END_TO_END, RANDOM
-from benchmarks.papers.tacbench_report.published import (
-    BEST_AGAINST_END_TO_END,
-    SHARES,
-    published,
-)
+from benchmarks.papers.tacbench_report.published import BEST_AGAINST_END_TO_END, SHARES, published
 
 Row = dict[str, Any]
 

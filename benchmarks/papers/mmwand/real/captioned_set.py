@@ -10,12 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from benchmarks.papers.mmwand.embedded_set import (
-    EmbeddedSet,
-    cached,
-    small_change,
-    touch_key,
-)
+from benchmarks.papers.mmwand.embedded_set import EmbeddedSet, cached, small_change, touch_key
 from benchmarks.published_touch.tvl import CaptionedTouch, read_tvl
 from benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.control.arrays import Image

@@ -17,10 +17,7 @@ from jaxtyping import Float
 from benchmarks.options import BenchmarkOptions
 from benchmarks.papers.mmwand.grasped_objects import run_grasped_objects
 from benchmarks.papers.mmwand.other_set import run_other_set
-from benchmarks.published_touch.objectfolder_real import (
-    read_objectfolder_real,
-    read_touches,
-)
+from benchmarks.published_touch.objectfolder_real import read_objectfolder_real, read_touches
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes.bootstrap import mean_interval
