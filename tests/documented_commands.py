@@ -1,5 +1,6 @@
 """What README, docs/ and CONTRIBUTING tell a person to type, and how the tests type it smaller."""
 
+import json
 import re
 import shlex
 import subprocess
@@ -16,6 +17,7 @@ from benchmarks.records import records_of
 from touchgoal.launch import __main__ as launch
 
 ROOT = Path(__file__).parents[1]
+NOTEBOOK = ROOT / "docs" / "first_steps.ipynb"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 # What a command is given, or given instead, so that it ends within seconds. The first line whose
@@ -126,7 +128,10 @@ def _lines(text: str) -> Iterator[tuple[str, bool]]:
 
 
 def snippets(page: Path) -> list[str]:
-    """The Python blocks of a page, in order."""
+    """The Python blocks of a page, in order; all of a notebook is one."""
+    if page.suffix == ".ipynb":
+        cells = [cell for cell in json.loads(page.read_text())["cells"] if "outputs" in cell]
+        return ["\n".join("".join(cell["source"]) for cell in cells)]
     return re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
 
 

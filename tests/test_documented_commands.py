@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from documented_commands import (
     NOT_RUN,
+    NOTEBOOK,
     PAGES,
     ROOT,
     Command,
@@ -209,7 +210,9 @@ def _serve(words: list[str], cell_file: Path) -> "subprocess.Popen[bytes]":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in PAGES if snippets(p)], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [p for p in [NOTEBOOK, *PAGES] if snippets(p)], ids=lambda page: page.name
+)
 def test_snippets_run(
     page: Path, desk: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -225,6 +228,8 @@ def test_snippets_run(
         program = desk / f"snippet_{i}.py"
         program.write_text(code.replace("n_steps=512", "n_steps=16").replace("100_000", "16"))
         made = runpy.run_path(str(program))
+    if page == NOTEBOOK:
+        assert made["done"] and set(made["curves"].costs) == {"image", "tactile", "text"}
     if page.stem == "README":
         assert len(made["curves"]) == 8  # one trajectory
     if page.stem == "rewards":

@@ -52,13 +52,6 @@ def record(out: Path, *options: str) -> Path:
     return out / "episodes"
 
 
-def costs_of(root: Path) -> Path:
-    """Return a file with the costs of an episode by touchgoal."""
-    [curves] = touchgoal.Reward.of_judge("gelsight_mini")(root)
-    np.save(root.parent / "costs.npy", curves.costs["fused"])
-    return root.parent / "costs.npy"
-
-
 def train_with_lerobot(python: Path, plugins: Path, folder: Path) -> None:
     """Train the maze's policy on frozen touch by lerobot-train; its first loss must be touchgoal's."""
     root, out = record(folder / "maze", "--task", "bead-maze"), folder / "trained"
@@ -123,8 +116,10 @@ def main() -> None:
         with closing(RunningTwin(TWIN, folder / "twin", 0)) as twin:
             print(run_with_plugins(plugins, python, HERE / "lerobot_arm.py", twin.cell_file))
         root = record(folder / "demo", "--env.objects", "wooden_block")
-        costs = costs_of(root)
-        print(run_with_plugins(plugins, python, HERE / "lerobot_reward.py", root, costs))
+        [own] = touchgoal.Reward.of_judge("gelsight_mini")(root)
+        np.save(folder / "own.npy", own.costs["fused"])
+        words = HERE / "lerobot_reward.py", root, folder / "own.npy"
+        print(run_with_plugins(plugins, python, *words))
         train_with_lerobot(python, plugins, folder)
         theirs = evaluate_with_lerobot(python, plugins, folder / "eval")
     here = evaluate_here()

@@ -1,7 +1,4 @@
-"""lerobot-train of a policy of touchgoal, in lerobot's environment: `lerobot_plugins.py` runs it.
-
-python tests/interop/lerobot_policy.py SET OUT      writes rows and loss of each step to OUT/steps.json
-"""
+"""lerobot-train of a policy of touchgoal on SET, in lerobot's environment; the steps go to OUT/steps.json."""
 
 import json
 import sys
