@@ -185,13 +185,14 @@ def slip(metrics: Metrics) -> str:
     return "; ".join("{} {:.2f} [{:.2f}, {:.2f}]".format(r["window"], *r["crop"]) for r in rows)
 
 
-def nearest(metrics: Metrics) -> str:
-    """Nearest-video accuracy of every encoder."""
+def nearest(metrics: Metrics, only: str = "") -> str:
+    """Nearest-video accuracy of every encoder, or of those with one of these words in their names."""
     rows = []
     for row in metrics["rows"]:
         low, high = row["nearest_interval"]
         name = row["encoder"].removeprefix("runs/").removesuffix("/encoder")
-        rows.append(f"{name} {row['nearest']:.2f} [{low:.2f}, {high:.2f}]")
+        if not only or any(word in name for word in only.split()):
+            rows.append(f"{name} {row['nearest']:.2f} [{low:.2f}, {high:.2f}]")
     return "; ".join(rows)
 
 
