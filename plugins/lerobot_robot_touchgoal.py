@@ -1,6 +1,6 @@
 """A cell's arm in lerobot: `--robot.type=touchgoal --robot.cell=cell.toml`, inside the cell's limits."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -33,6 +33,8 @@ class TouchgoalRobotConfig(RobotConfig):
     """Cell file of an arm, or the cell.json of a twin."""
     yes: bool = False
     """Do not ask for the typed confirmation (for tests)."""
+    columns: list[str] = field(default_factory=lambda: ["state"])
+    """What lerobot joins to its `observation.state`: state, command, tcp_pose, wrench, load, age."""
 
 
 class TouchgoalRobot(Robot):
@@ -50,12 +52,20 @@ class TouchgoalRobot(Robot):
         if self._cell.arm == "sim":
             raise UserError("give the cell file of an arm or of a twin, not of a simulated arm")
         features = ft.features_of(len(cell_limits(self._cell).arm.home))
-        self._state, self._action = features[ft.STATE].names, features[ft.ACTION].names
+        self._columns: dict[str, list[str]] = {}
+        for column in config.columns:
+            if (key := f"observation.{column}") not in features:
+                raise UserError(f"there is no {key}: give columns of control/features.py")
+            start = "" if key == ft.STATE else f"{column}."
+            self._columns[key] = [start + name for name in features[key].names]
+        self._action = features[ft.ACTION].names
         formats = camera_formats(self._cell).items()
         self._images = {key.removeprefix(ft.IMAGE_PREFIX): (*f[1:], 3) for key, f in formats}
         self._connection: CellConnection | None = None
 
-    observation_features = property(lambda self: dict.fromkeys(self._state, float) | self._images)
+    observation_features = property(
+        lambda self: dict.fromkeys(sum(self._columns.values(), []), float) | self._images
+    )
     action_features = property(lambda self: dict.fromkeys(self._action, float))
     is_connected = property(lambda self: self._connection is not None)
     is_calibrated = True
@@ -80,11 +90,12 @@ class TouchgoalRobot(Robot):
         self._connection = connection
 
     def get_observation(self) -> dict[str, Any]:
-        """Return the newest state and images."""
-        observation = self._loop.reader.read().observation
-        state = zip(self._state, observation.pop(ft.STATE).tolist(), strict=True)
-        named = {key.removeprefix(ft.IMAGE_PREFIX): value for key, value in observation.items()}
-        return {**dict(state), **{k: v for k, v in named.items() if k in self._images}}
+        """Return the newest numbers and images."""
+        seen = self._loop.reader.read().observation
+        found: dict[str, Any] = {name: seen[ft.IMAGE_PREFIX + name] for name in self._images}
+        for key, names in self._columns.items():
+            found |= zip(names, seen[key].tolist(), strict=True)
+        return found
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Run one control tick; return the action as it was done. DriverError: the arm was stopped."""

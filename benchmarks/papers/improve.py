@@ -121,10 +121,8 @@ class _Lab:
 
 def run(config: Config) -> dict[str, Any]:
     """Record, improve by each filter, try the policies."""
-    if config.out is not None:
-        return _run(config, config.out)
     with TemporaryDirectory() as folder:
-        return _run(config, Path(folder))
+        return _run(config, config.out or Path(folder))
 
 
 def _run(config: Config, out: Path) -> dict[str, Any]:

@@ -46,10 +46,8 @@ class Config(BenchmarkOptions):
 
 def run(config: Config) -> dict[str, Any]:
     """Record and embed what is missing, judge, and return the tables."""
-    if config.out is not None:
-        return _run(config, config.out)
     with tempfile.TemporaryDirectory() as folder:
-        return _run(config, Path(folder))
+        return _run(config, config.out or Path(folder))
 
 
 def _run(config: Config, folder: Path) -> dict[str, Any]:

@@ -92,16 +92,11 @@ class _Demonstrations:
     validation: SequenceDataset  # other successes
     policy: PolicyConfig
 
-    def windows(self, weights: np.ndarray | None) -> SequenceDataset:
-        return SequenceDataset(self.recordings, self.policy, weights)
-
 
 def run(config: Config) -> dict[str, Any]:
     """Record what is missing, train and judge."""
-    if config.out is not None:
-        return _run(config, config.out)
     with tempfile.TemporaryDirectory() as folder:
-        return _run(config, Path(folder))
+        return _run(config, config.out or Path(folder))
 
 
 def _run(config: Config, out: Path) -> dict[str, Any]:
@@ -176,10 +171,13 @@ class _Imitation:
     def __call__(self, job: tuple[str, int]) -> dict[str, float]:
         """Return successes, mean progress and the share of the windows that are imitated."""
         name, seed = job
-        weights = self.weights[name]
+        weights, data, options = self.weights[name], self.data, TrainerOptions(seed=seed)
         with tempfile.TemporaryDirectory() as folder:
-            _train(self.data, self.data.windows(weights), self.config.train, Path(folder), seed)
-            trials = _try(Path(folder) / POLICY, self.config.trials, 1)
+            windows = SequenceDataset(data.recordings, data.policy, weights)
+            train(
+                data.policy, windows, data.validation, self.config.train, Path(folder), options, {}
+            )
+            trials = _try(Path(folder) / POLICY, self.config.trials)
         return {
             "successes": float(sum(t.success for t in trials)),
             "progress": float(np.mean([t.progress for t in trials])),
@@ -201,18 +199,12 @@ def _imitate(
     return rows
 
 
-def _train(
-    data: _Demonstrations, windows: SequenceDataset, config: TrainConfig, out: Path, seed: int
-) -> None:
-    train(data.policy, windows, data.validation, config, out, TrainerOptions(seed=seed), {})
-
-
-def _try(policy: Path, trials: int, workers: int) -> list[Trial]:
+def _try(policy: Path, trials: int) -> list[Trial]:
     copy_parts(policy, {ESTIMATOR: _ESTIMATOR})
     maker = SavedPolicy(policy)
     env = maker().env_config(_TASK)
     specs = trial_specs(env, trials, seeds.POLICY_TEST.start)
-    return list(run_trials(env, maker, specs, workers))
+    return list(run_trials(env, maker, specs, 1))
 
 
 def _imitation_table(rows: dict[str, list[dict[str, float]]], sizes: str, trials: int) -> str:

@@ -16,7 +16,10 @@ def main() -> None:
     register_third_party_plugins()
     from lerobot_robot_touchgoal import TouchgoalRobotConfig
 
-    robot = make_robot_from_config(TouchgoalRobotConfig(cell=sys.argv[1], yes=True))
+    columns = ["state", "tcp_pose", "wrench"]
+    robot = make_robot_from_config(
+        TouchgoalRobotConfig(cell=sys.argv[1], yes=True, columns=columns)
+    )
     with robot:
         before = robot.get_observation()
         assert set(before) == set(robot.observation_features)
@@ -33,6 +36,8 @@ def main() -> None:
     print(
         f"joint 1: {moved:.3f} rad moved, {sent:.3f} sent; hand: {1e3 * after['gripper.pos']:.0f} mm"
     )
+    turned = np.hypot(*(after[f"tcp_pose.{i}"] - before[f"tcp_pose.{i}"] for i in "xy"))
+    assert 0.8 < turned / (moved * np.hypot(before["tcp_pose.x"], before["tcp_pose.y"])) < 1.2
     assert 0.18 < moved < 0.35 and np.isclose(after["gripper.pos"], 0.02, atol=2e-3)
 
 

@@ -26,10 +26,7 @@ from touchgoal.encoders.training.batch_noise import BatchNoise  # noqa: E402
 from touchgoal.episodes.store import EpisodeSet  # noqa: E402
 from touchgoal.policies.acting import LearnedPolicy  # noqa: E402
 from touchgoal.policies.checkpoint import SavedPolicy  # noqa: E402
-from touchgoal.policies.training.sequence_dataset import (  # noqa: E402
-    SequenceDataset,
-    load_recordings,
-)
+from touchgoal.policies.training import sequence_dataset as data  # noqa: E402
 from touchgoal.policies.training.train import PolicyLoss, make_batch  # noqa: E402
 
 ROOT = HERE.parents[1]
@@ -58,8 +55,8 @@ def train_with_lerobot(python: Path, plugins: Path, folder: Path) -> None:
     run_with_plugins(plugins, python, HERE / "lerobot_policy.py", root, out)
     (rows, theirs), *_ = json.loads((out / "steps.json").read_text())
     episodes, actor = EpisodeSet(root), touchgoal.load_policy("bead-maze")
-    recorded = load_recordings(episodes, [0], actor.config, actor.touch)
-    batch = make_batch(SequenceDataset(recorded, actor.config), torch.tensor(rows))
+    recorded = data.load_recordings(episodes, [0], actor.config, actor.touch)
+    batch = make_batch(data.SequenceDataset(recorded, actor.config), torch.tensor(rows))
     network = SavedPolicy(actor.directory).network()
     torch.manual_seed(0)
     own = PolicyLoss(network)(**batch, noise=BatchNoise(torch.default_generator))["loss"].item()

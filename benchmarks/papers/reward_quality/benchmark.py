@@ -66,10 +66,8 @@ class Config(BenchmarkOptions, Sizes):
 
 def run(config: Config) -> dict[str, Any]:
     """Record, embed, measure and judge."""
-    if config.out is not None:
-        return _run(config, config.out)
     with tempfile.TemporaryDirectory() as folder:
-        return _run(config, Path(folder))
+        return _run(config, config.out or Path(folder))
 
 
 def _run(config: Config, folder: Path) -> dict[str, Any]:
