@@ -222,7 +222,7 @@ maze-wrench-policy: $(READY)
 	mv policies/weights/bead_maze_wrench/touch/* encoders/weights/gelsight_mini_markers_mae/
 	rmdir policies/weights/bead_maze_wrench/touch
 
-# Without an NVIDIA GPU torch comes from its own index, if that can be reached: 0.2 GB, with CUDA from PyPI 3.8 GB.
+# Without an NVIDIA GPU torch comes from its own index, if that can be reached: 0.2 GB, no CUDA.
 CPU_TORCH ?= https://download.pytorch.org/whl/cpu
 REACHED = import urllib.request as r; r.urlopen("$(CPU_TORCH)/torch/", timeout=5)
 $(READY): pyproject.toml constraints.txt

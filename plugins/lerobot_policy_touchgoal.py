@@ -53,7 +53,6 @@ class TouchgoalConfig(PreTrainedConfig):
     """Learning rate of AdamW."""
     device: str | None = "cpu"
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
-    """By lerobot: none, since the network does it."""
 
     observation_delta_indices = reward_delta_indices = None
 
@@ -138,7 +137,8 @@ class TouchgoalPolicy(PreTrainedPolicy):
         observed = {key: value for key, value in batch.items() if isinstance(value, Tensor)}
         for i in range(len(next(iter(observed.values())))):
             if i == len(self._actors):
-                self._actors.append(self._saved(network=self.network))
+                on_cpu = copy.deepcopy(self.network).cpu().eval()
+                self._actors.append(self._saved(network=on_cpu))
             yield self._actors[i], {k: as_recorded(k, v[i]) for k, v in observed.items()}
 
 

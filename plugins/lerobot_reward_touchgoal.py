@@ -7,7 +7,7 @@ writes `touchgoal_progress.parquet` into the set, which lerobot's RA-BC reads.
 
 import argparse
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 from huggingface_hub import snapshot_download
+from lerobot.configs import NormalizationMode
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.rewards.factory import make_reward_model
@@ -66,6 +67,7 @@ class TouchgoalConfig(RewardModelConfig):
     fps: float = CONTROL_HZ
     """Frames per second of what is measured."""
     device: str | None = "cpu"
+    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
 
 
 class TouchgoalRewardModel(PreTrainedRewardModel):

@@ -34,7 +34,7 @@ class TouchgoalRobotConfig(RobotConfig):
     yes: bool = False
     """Do not ask for the typed confirmation (for tests)."""
     columns: list[str] = field(default_factory=lambda: ["state"])
-    """What lerobot joins to its `observation.state`: state, command, tcp_pose, wrench, load, age."""
+    """Numbers that lerobot records as one `observation.state`: state, command, tcp_pose, wrench, load, age."""
 
 
 class TouchgoalRobot(Robot):
@@ -54,8 +54,9 @@ class TouchgoalRobot(Robot):
         features = ft.features_of(len(cell_limits(self._cell).arm.home))
         self._columns: dict[str, list[str]] = {}
         for column in config.columns:
-            if (key := f"observation.{column}") not in features:
-                raise UserError(f"there is no {key}: give columns of control/features.py")
+            key, absent = f"observation.{column}", ft.LOAD if self._cell.load_cell is None else ""
+            if key not in features or key == absent or key.startswith(ft.IMAGE_PREFIX):
+                raise UserError(f"this cell has no column {column}: leave it out of columns")
             start = "" if key == ft.STATE else f"{column}."
             self._columns[key] = [start + name for name in features[key].names]
         self._action = features[ft.ACTION].names
