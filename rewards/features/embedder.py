@@ -39,6 +39,7 @@ from touchgoal.rewards.features.embedded import (
     split_features,
     take_rows,
 )
+from touchgoal.rewards.features.steady_images import STEADY, steady_images
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.goals import (
     Bank,
@@ -95,7 +96,9 @@ class EpisodeEmbedder:
         # by the keys that are read, too
         self._ends: dict[tuple[EpisodeEnd | Bank | GoalFile, tuple[str, ...]], SuccessfulEnds] = {}
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
-        self._images_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
+        self._steady = isinstance(towers, OfflineTowers)
+        name = STEADY if self._steady else towers.name.rpartition("#")[2]
+        self._images_with = EmbeddingSource(name, camera)
         self.made_with = self._images_with  # of episodes with touch, if there is an encoder
         if encoder is not None:
             if self._aligned is not None:
@@ -218,17 +221,21 @@ class EpisodeEmbedder:
         """Return image, and with parts the pooled features and map of each camera."""
         if not self.parts:
             images = frames.get(self.camera)
-            return {} if images is None else {IMAGE: _unit(self._towers.embed_images(images))}
+            return {} if images is None else {IMAGE: self._embed_images(images)}
         features: dict[str, np.ndarray] = {}
         for key in dict.fromkeys((*CAMERAS, self.camera)):
             if key in frames and isinstance(self._towers, OfflineTowers):
-                pooled, features[map_name(key)] = self._towers.embed_with_maps(frames[key])
+                seen = steady_images(frames[key])
+                pooled, features[map_name(key)] = self._towers.embed_with_maps(seen)
                 features[camera_name(key)] = _unit(pooled)
             elif key in frames:
-                features[camera_name(key)] = _unit(self._towers.embed_images(frames[key]))
+                features[camera_name(key)] = self._embed_images(frames[key])
         if self.camera in frames:
             features[IMAGE] = features[camera_name(self.camera)]
         return features
+
+    def _embed_images(self, images: Images) -> Float32[np.ndarray, "n d"]:
+        return _unit(self._towers.embed_images(steady_images(images) if self._steady else images))
 
     def embed_touch(
         self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]

@@ -21,7 +21,7 @@ from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
 
-_FORMAT = 2  # of the files, and of all code between a frame and its embedding
+_FORMAT = 3  # of the files, and of all code between a frame and its embedding
 
 
 def embed_trajectory(
