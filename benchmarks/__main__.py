@@ -43,7 +43,6 @@ BENCHMARKS = {
     ),
     "reward-use": ("papers.reward_use", "learning from the demonstrations that a reward accepts"),
     "improve": ("papers.improve", "a policy improved by its own runs, by what accepts them"),
-    "grasp-search": ("papers.grasp_search", "grasps found by trial on the cost"),
     "grip-search": ("papers.grip_search", "grip force found by trial where a crush is not seen"),
     "shaping": ("papers.shaping", "SAC by a sparse reward, and shaped by the cost"),
     "tacbench": ("papers.tacbench.benchmark", "force, slip, pose, grasp, cloth from frozen touch"),

@@ -102,12 +102,6 @@ def imitated(metrics: Metrics) -> str:
     return "; ".join(f"{name} {rate}" for name, rate in found.items())
 
 
-def grasps_found(metrics: Metrics) -> str:
-    """Objects lifted by the grasp that each search ended with."""
-    lifted = metrics["lifted"].items()
-    return "; ".join(f"{name} {SuccessRate(sum(done), len(done))}" for name, done in lifted)
-
-
 def grips_found(metrics: Metrics, trials: str) -> str:
     """Searches that end with a force that neither loses nor crushes the rod, by reward."""
     ends = {row: by_trials[trials] for row, by_trials in metrics["ends"].items()}

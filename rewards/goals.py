@@ -198,23 +198,17 @@ class GoalFile:
 
 @dataclass(frozen=True)
 class Sentence:
-    """Description of how the object feels; UserError if it is negated or contradicts itself.
-
-    With a baseline sentence, such as "an object", only the direction from it to the sentence counts
-    (VLM-RM, arXiv 2310.12921): see `distance.cost.text_distances`.
-    """
+    """Description of how the object feels; UserError if it is negated or contradicts itself."""
 
     text: str
-    baseline: str = ""
     modalities: ClassVar[tuple[Modality, ...]] = ("text",)
 
     def __post_init__(self) -> None:
-        """Check both sentences."""
+        """Check the sentence."""
         check_goal_sentence(self.text)
-        check_goal_sentence(self.baseline)
 
     def __str__(self) -> str:
-        return f"text:{self.text}" + (f"|{self.baseline}" if self.baseline else "")
+        return f"text:{self.text}"
 
 
 @dataclass(frozen=True)
@@ -279,9 +273,8 @@ def parse_goal(text: str, keys: Mapping[str, str] | None = None) -> GoalSpec:
         return Bank(Path(value), keys or {})
     if kind == "goal" and value:
         return GoalFile(Path(value))
-    if kind == "text" and value.partition("|")[0].strip():
-        sentence, _, baseline = value.partition("|")
-        return Sentence(sentence.strip(), baseline.strip())
+    if kind == "text" and value:
+        return Sentence(value)
     if kind == "force" and re.fullmatch(r"-?\d*\.?\d+", value):
         return GripForce(float(value))
     raise UserError(f"goal '{text}' is not understood; write {FORMS}")

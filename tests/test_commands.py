@@ -250,13 +250,6 @@ def test_benchmark_reward_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert used["imitation"]["none"][0]["used"] == 1 > accepted["used"]
 
 
-@pytest.mark.slow
-def test_grasps_are_found_by_trial(tmp_path: Path) -> None:
-    sizes = "--scenes 1 --rounds 1 --samples 6 --goals 1 --error 0.01 --env.control-hz 10"
-    run_benchmark("grasp-search", *sizes.split(), "--out", tmp_path)
-    assert json.loads((tmp_path / "metrics.json").read_text())["lifted"]["fused"] == [True]
-
-
 def test_an_encoder_is_trained_and_validated_on_fit_data(
     episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

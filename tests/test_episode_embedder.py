@@ -3,17 +3,21 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from PIL import Image
 from toy_towers import PaintTowers
 
-from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
+import touchgoal
+from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT, WRIST
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS
+from touchgoal.encoders.towers.towers import OfflineTowers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.rewards.distance.cost import compute_curves
@@ -128,3 +132,16 @@ def test_an_episode_embedded_in_chunks_is_the_whole(embedder: EpisodeEmbedder) -
     for name, values in apart.features.items():
         if name != "slip":  # counts from the first frame
             assert values == pytest.approx(once.features[name][7:], abs=1e-5), name
+
+
+def test_noise_compression_and_size_of_a_camera_hardly_move_what_is_seen() -> None:
+    env = touchgoal.make("pick-place", cameras=("wrist",), camera_size=(256, 256), tactile=False)
+    image = env.reset(seed=0)[0][WRIST]
+    small = cv2.resize(image, (128, 128), interpolation=cv2.INTER_AREA)
+    noisy = np.clip(image + np.random.default_rng(0).normal(0, 2, image.shape), 0, 255)
+    sent = cv2.imdecode(cv2.imencode(".jpg", noisy.astype(np.uint8))[1], cv2.IMREAD_COLOR)
+    towers = OfflineTowers()
+    here, there = EpisodeEmbedder(towers, None, WRIST), towers.embed_images(sent[None])
+    [seen], [received] = (here.embed_cameras({WRIST: i[None]})["wrist"] for i in (small, sent))
+    raw = F.cosine_similarity(towers.embed_images(small[None]), there)
+    assert 1 - seen @ received < 0.02 < 0.08 < 1 - float(raw)

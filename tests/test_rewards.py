@@ -31,12 +31,9 @@ from touchgoal.rewards.goals import (
 )
 from touchgoal.rewards.metrics import (
     EPS_FLOOR,
-    find_peaks,
-    kendall_tau_b,
     largest_rebound,
     measure_curve,
     noise,
-    spearman,
 )
 from touchgoal.rewards.report.report import write_report
 from touchgoal.runtime.errors import UserError
@@ -281,20 +278,6 @@ CURVES = st.lists(st.integers(-6, 6), min_size=3, max_size=24).map(
     lambda values: np.array(values) / 2
 )
 STEP = np.where(np.arange(100) < 50, 1.0, 0.0)
-
-
-def test_correlations_by_hand() -> None:
-    x, y = np.array([1.0, 2.0, 2.0, 3.0]), np.array([1.0, 3.0, 2.0, 4.0])
-    # Ranks centred: (-1.5, 0, 0, 1.5) and (-1.5, .5, -.5, 1.5): 4.5 / sqrt(4.5 * 5).
-    assert spearman(x, y) == pytest.approx(0.9**0.5)
-    # 5 concordant pairs, 1 tie in x of 6 pairs: 5 / sqrt(5 * 6).
-    assert kendall_tau_b(x, y) == pytest.approx(5 / 30**0.5)
-
-
-def test_peaks_by_hand() -> None:
-    """A plateau is one peak, at its middle; ends are none; prominence is over the higher base."""
-    d = np.array([3.0, 1.0, 2.0, 2.0, 2.0, 1.5, 2.5, 0.0, 0.2, 0.0, 3.0])
-    assert find_peaks(d, 0.5).tolist() == [3, 6] and find_peaks(d, 1.0).tolist() == [6]
 
 
 @given(CURVES)

@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from benchmarks.options import CORES, BenchmarkOptions
-from benchmarks.papers.cross_entropy import Points, search
 from benchmarks.papers.fragile_carry import OneForce
 from touchgoal.control.features import CAMERAS, TACTILE, TRUTH_SUCCESS, WRENCH, Observation
 from touchgoal.policies.evaluation.success_rate import SuccessRate
@@ -131,21 +130,27 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _search(config: Config, table: _Table, row: str, samples: int, seed: Sequence[int]) -> str:
-    """Return what the last mean does to the rod: "safe", "lost" or "crushed"."""
+    """Return what the last mean does to the rod: "safe", "lost" or "crushed".
+
+    Of equal costs the force that was drawn first wins.
+    """
     rng = np.random.default_rng(seed)
 
-    def nearest(forces: Points) -> np.ndarray:
-        return np.rint((forces - _LEAST) / (_MOST - _LEAST) * (config.forces - 1)).astype(int)
+    def nearest(forces: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+        at = np.rint((forces - _LEAST) / (_MOST - _LEAST) * (config.forces - 1))
+        return at.clip(0, config.forces - 1).astype(int)
 
-    def costs(forces: Points) -> np.ndarray:
+    def costs(at: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         if row == "chance":
-            return rng.random(len(forces))
-        at = nearest(forces[:, 0]).clip(0, config.forces - 1)
+            return rng.random(len(at))
         return 1.0 - table.arrived[at] if row == "sparse" else table.costs[row][at]
 
-    middle, spread = np.full(1, (_LEAST + _MOST) / 2), np.full(1, (_MOST - _LEAST) / np.sqrt(12))
-    [end] = search(rng, middle, spread, config.rounds, samples, costs)
-    at = int(nearest(end).clip(0, config.forces - 1))
+    mean, spread = (_LEAST + _MOST) / 2, (_MOST - _LEAST) / np.sqrt(12)
+    for _ in range(config.rounds):
+        forces = rng.normal(mean, spread, samples)
+        best = forces[np.argsort(costs(nearest(forces)), kind="stable")[: max(samples // 3, 2)]]
+        mean, spread = best.mean(), best.std()
+    [at] = nearest(np.array([mean]))
     return "safe" if table.safe[at] else "crushed" if table.arrived[at] else "lost"
 
 

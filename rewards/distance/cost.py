@@ -26,7 +26,6 @@ from touchgoal.rewards.distance.parts import (
 from touchgoal.rewards.features.embedded import (
     IMAGE,
     TEXT,
-    TEXT_BASELINE,
     TOUCH,
     EmbeddedEpisode,
     EmbeddedGoal,
@@ -34,7 +33,6 @@ from touchgoal.rewards.features.embedded import (
 )
 from touchgoal.rewards.value import Value
 
-_ALPHA = 0.5  # share of the way to the line through baseline and sentence
 _FORCE_UNIT = 0.5  # share of a force goal: without force, or with twice as much, it costs 0.64
 
 
@@ -87,7 +85,7 @@ def plain_distances(mine: Features, goal: Features, completed: bool) -> Costs:
         touch, goals = (complete(f[TOUCH]) if completed else f[TOUCH] for f in (mine, goal))
         raw["tactile"] = soft_minimum(touch_distances(touch, goals))
     if TEXT in goal:
-        raw["text"] = soft_minimum(text_distances(mine[TOUCH], goal[TEXT], goal.get(TEXT_BASELINE)))
+        raw["text"] = soft_minimum(text_distances(mine[TOUCH], goal[TEXT]))
     return raw
 
 
@@ -102,23 +100,7 @@ def complete(touch: Float32[np.ndarray, "*n k"]) -> Float32[np.ndarray, "*n k+1"
 
 
 def text_distances(
-    touch: Float32[np.ndarray, "n sides k"],
-    goals: Float32[np.ndarray, "g k"],
-    baseline: Float32[np.ndarray, "b k"] | None = None,
+    touch: Float32[np.ndarray, "n sides k"], goals: Float32[np.ndarray, "g k"]
 ) -> Float[np.ndarray, "n g"]:
-    """Return the distance of each touch to each sentence, mean over the fingertips.
-
-    With a baseline sentence, a touch is first moved halfway to the line through baseline and
-    sentence; the distance is then half the squared one (VLM-RM with alpha = 0.5). What does not
-    distinguish the two sentences so counts less.
-    """
-    if baseline is None or not len(baseline):
-        return 1 - np.mean(touch, axis=1, dtype=np.float64) @ goals.astype(np.float64).T
-    distances = []
-    for goal in goals.astype(np.float64):
-        line = goal - baseline[0]
-        line /= max(float(np.linalg.norm(line)), 1e-9)
-        along = ((touch - baseline[0]) @ line)[..., None] * line + baseline[0]
-        moved = _ALPHA * along + (1 - _ALPHA) * touch
-        distances.append(((moved - goal) ** 2).sum(-1).mean(1) / 2)
-    return np.stack(distances, axis=1)
+    """Return the distance of each touch to each sentence, mean over the fingertips."""
+    return 1 - np.mean(touch, axis=1, dtype=np.float64) @ goals.astype(np.float64).T

@@ -10,7 +10,7 @@
     wrench          (n, 6)         external force N and torque Nm, base frame
     tcp_pose        (n, 7)         xyz m, quaternion wxyz, base frame
     image           (n, d)         pooled features of the measured camera; or a sentence as its goal
-    text            (n, k)         sentence, comparable with touch; text_baseline: the one against it
+    text            (n, k)         sentence, comparable with touch
 
 Without parts there are image and touch alone. Force, centre and slip need a sensor with a file.
 """
@@ -35,7 +35,7 @@ from touchgoal.runtime.atomic_write import atomic_write
 Features = Mapping[str, np.ndarray]
 """Arrays by part, frames (or goals) first."""
 
-IMAGE, TOUCH, TEXT, TEXT_BASELINE = "image", "touch", "text", "text_baseline"
+IMAGE, TOUCH, TEXT = "image", "touch", "text"
 FINGERTIPS = (TOUCH, "held", "force", "centre", "slip")
 """Parts with an axis of fingertips."""
 ARM = {"wrench": WRENCH, "tcp_pose": TCP_POSE}
@@ -121,7 +121,7 @@ def split_features(features: Features) -> tuple[Features, Features]:
 
 def cameras_of(features: Features) -> list[str]:
     """Return the names of the cameras that have pooled features of their own."""
-    others = (IMAGE, TEXT, TEXT_BASELINE, *_TOUCHED)
+    others = (IMAGE, TEXT, *_TOUCHED)
     return [name for name in features if name not in others and not name.endswith(_MAP)]
 
 

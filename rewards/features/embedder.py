@@ -27,7 +27,6 @@ from touchgoal.rewards.features.embedded import (
     ARM,
     IMAGE,
     TEXT,
-    TEXT_BASELINE,
     TOUCH,
     EmbeddedEpisode,
     EmbeddedGoal,
@@ -96,8 +95,7 @@ class EpisodeEmbedder:
         # by the keys that are read, too
         self._ends: dict[tuple[EpisodeEnd | Bank | GoalFile, tuple[str, ...]], SuccessfulEnds] = {}
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
-        self._steady = isinstance(towers, OfflineTowers)
-        name = STEADY if self._steady else towers.name.rpartition("#")[2]
+        name = STEADY if isinstance(towers, OfflineTowers) else towers.name.rpartition("#")[2]
         self._images_with = EmbeddingSource(name, camera)
         self.made_with = self._images_with  # of episodes with touch, if there is an encoder
         if encoder is not None:
@@ -210,8 +208,6 @@ class EpisodeEmbedder:
             features |= self._embed_goal("tactile", goals["tactile"], own)[1]
         if isinstance(text := goals.get("text"), Sentence):
             features[TEXT] = self.embed_sentences([text.text])
-            if text.baseline:
-                features[TEXT_BASELINE] = self.embed_sentences([text.baseline])
         if isinstance(force := goals.get("force"), GripForce):
             features["force"] = np.full((1, len(own.sides)), force.newtons, np.float32)
         forms = {name: str(spec) for name, spec in goals.items()}
@@ -219,23 +215,23 @@ class EpisodeEmbedder:
 
     def embed_cameras(self, frames: Frames) -> Features:
         """Return image, and with parts the pooled features and map of each camera."""
-        if not self.parts:
-            images = frames.get(self.camera)
-            return {} if images is None else {IMAGE: self._embed_images(images)}
         features: dict[str, np.ndarray] = {}
-        for key in dict.fromkeys((*CAMERAS, self.camera)):
-            if key in frames and isinstance(self._towers, OfflineTowers):
-                seen = steady_images(frames[key])
-                pooled, features[map_name(key)] = self._towers.embed_with_maps(seen)
-                features[camera_name(key)] = _unit(pooled)
-            elif key in frames:
-                features[camera_name(key)] = self._embed_images(frames[key])
-        if self.camera in frames:
-            features[IMAGE] = features[camera_name(self.camera)]
+        for key in dict.fromkeys((*CAMERAS * self.parts, self.camera)):
+            if (images := frames.get(key)) is None:
+                continue
+            name = camera_name(key) if self.parts else IMAGE
+            if not isinstance(self._towers, OfflineTowers):
+                pooled = self._towers.embed_images(images)
+            elif self.parts:
+                pooled, features[map_name(key)] = self._towers.embed_with_maps(
+                    steady_images(images)
+                )
+            else:
+                pooled = self._towers.embed_images(steady_images(images))
+            features[name] = _unit(pooled)
+            if key == self.camera:
+                features[IMAGE] = features[name]
         return features
-
-    def _embed_images(self, images: Images) -> Float32[np.ndarray, "n d"]:
-        return _unit(self._towers.embed_images(steady_images(images) if self._steady else images))
 
     def embed_touch(
         self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-STEADY = "offline, steady images"
-"""Name in an `EmbeddingSource` of the offline towers with such images."""
+STEADY = "offline, steady images"  # in an `EmbeddingSource`: the offline towers, of such images
 _SHARP, _SIDE = 128, 224  # px, shorter side: of what is told apart, and of the result
 _SMOOTHING, _GRAIN = 1.0, 4.0  # px of the smaller image; counts, which cover a camera's own
 
@@ -22,11 +21,9 @@ def steady_images(images: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, "n 
     small, size = ((side * w // min(h, w), side * h // min(h, w)) for side in (_SHARP, _SIDE))
     steady, grain = np.empty((len(images), *size[::-1], 3), np.uint8), _grain(*size)
     for i, image in enumerate(images):
-        smooth = cv2.GaussianBlur(
-            cv2.resize(image, small, interpolation=cv2.INTER_AREA), (0, 0), _SMOOTHING
-        )
-        large = cv2.resize(smooth, size, interpolation=cv2.INTER_CUBIC)
-        steady[i] = np.clip(large + grain, 0, 255)
+        sharp = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+        smooth = cv2.GaussianBlur(sharp, (0, 0), _SMOOTHING)
+        steady[i] = np.clip(cv2.resize(smooth, size, interpolation=cv2.INTER_CUBIC) + grain, 0, 255)
     return steady
 
 

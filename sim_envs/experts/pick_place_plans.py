@@ -51,12 +51,6 @@ def make_plan(env: PickPlace, outcome: Outcome) -> Plan:
     return _PLANS[outcome](env)
 
 
-def lift_plan(env: PickPlace, shift: Sequence[float]) -> Plan:
-    """Return a plan that grasps `shift` (x, y, z in m) beside the object, lifts and holds."""
-    lifted = _before(_pick_and_place(env, grasp_shift=shift), "carry")
-    return [*lifted, Waypoint("hold", None, 0.0, 0.3)]
-
-
 def picked_body(outcome: Outcome) -> str:
     """Return the name of the body that the hand takes."""
     return "distractor_1" if outcome == "wrong_object" else "object"
