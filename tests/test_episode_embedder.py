@@ -140,6 +140,7 @@ def test_noise_compression_and_size_of_a_camera_hardly_move_what_is_seen() -> No
     small = cv2.resize(image, (128, 128), interpolation=cv2.INTER_AREA)
     noisy = np.clip(image + np.random.default_rng(0).normal(0, 2, image.shape), 0, 255)
     sent = cv2.imdecode(cv2.imencode(".jpg", noisy.astype(np.uint8))[1], cv2.IMREAD_COLOR)
+    assert sent is not None
     towers = OfflineTowers()
     here, there = EpisodeEmbedder(towers, None, WRIST), towers.embed_images(sent[None])
     [seen], [received] = (here.embed_cameras({WRIST: i[None]})["wrist"] for i in (small, sent))
