@@ -28,7 +28,7 @@ REAL_SCENE = "recorded, not simulated"
 class EmbeddingSource:
     """Encoders, camera and sensor of embeddings; only those of equal ones can be compared."""
 
-    towers: str  # "offline", or the hash of a CLIP's weights
+    towers: str  # `steady_images.STEADY`, or the hash of a CLIP's weights
     camera: str  # key of the camera; "" for a plain video, whose camera is unknown
     encoder: str = ""  # hash of the touch encoder's weights and preprocessor; "" without touch
     sensor: str = ""  # name of the fingertip sensor; "" without touch
