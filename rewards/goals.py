@@ -206,6 +206,8 @@ class Sentence:
     def __post_init__(self) -> None:
         """Check the sentence."""
         check_goal_sentence(self.text)
+        if "|" in self.text:  # which parted it from a second one
+            raise UserError(f"goal '{self}': give one sentence, without |")
 
     def __str__(self) -> str:
         return f"text:{self.text}"

@@ -19,7 +19,7 @@ from touchgoal.launch.__main__ import COMMANDS
 # in a change that says so.
 WHEEL_LINES = 50_985  # of Python
 REPOSITORY_LINES = 63_643  # of Python, with benchmarks, plugins and docs
-TEST_LINES = 19_486  # of Python
+TEST_LINES = 19_490  # of Python
 PAGE_WORDS = 12_000  # README, CHANGELOG and docs/*.md
 COMMANDS_IN_ALL = 34  # sub-commands included
 OPTIONS_IN_ALL = 405  # of all commands, each with its own

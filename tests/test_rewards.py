@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from touchgoal.control.features import TACTILE_LEFT, TACTILE_RIGHT
+from touchgoal.rewards import metrics
 from touchgoal.rewards.curves import Contact, Curves, potential_reward
 from touchgoal.rewards.distance.cost import compute_curves, plain_distances
 from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, separating
@@ -29,12 +30,7 @@ from touchgoal.rewards.goals import (
     assign_goals,
     parse_goal,
 )
-from touchgoal.rewards.metrics import (
-    EPS_FLOOR,
-    largest_rebound,
-    measure_curve,
-    noise,
-)
+from touchgoal.rewards.metrics import EPS_FLOOR, largest_rebound, measure_curve, noise
 from touchgoal.rewards.report.report import write_report
 from touchgoal.runtime.errors import UserError
 
@@ -278,6 +274,20 @@ CURVES = st.lists(st.integers(-6, 6), min_size=3, max_size=24).map(
     lambda values: np.array(values) / 2
 )
 STEP = np.where(np.arange(100) < 50, 1.0, 0.0)
+
+
+def test_correlations_by_hand() -> None:
+    x, y = np.array([1.0, 2.0, 2.0, 3.0]), np.array([1.0, 3.0, 2.0, 4.0])
+    # Ranks centred: (-1.5, 0, 0, 1.5) and (-1.5, .5, -.5, 1.5): 4.5 / sqrt(4.5 * 5).
+    assert metrics.spearman(x, y) == pytest.approx(0.9**0.5)
+    # 5 concordant pairs, 1 tie in x of 6 pairs: 5 / sqrt(5 * 6).
+    assert metrics.kendall_tau_b(x, y) == pytest.approx(5 / 30**0.5)
+
+
+def test_peaks_by_hand() -> None:
+    """A plateau is one peak, at its middle; ends are none; prominence is over the higher base."""
+    d = np.array([3.0, 1.0, 2.0, 2.0, 2.0, 1.5, 2.5, 0.0, 0.2, 0.0, 3.0])
+    assert [metrics.find_peaks(d, eps).tolist() for eps in (0.5, 1.0)] == [[3, 6], [6]]
 
 
 @given(CURVES)

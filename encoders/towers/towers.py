@@ -20,7 +20,7 @@ from touchgoal.runtime.errors import UserError, wheel_folder
 
 BATCH = 32
 _CPU_IMAGES = 4  # images that a core takes at a time
-_SIDE = 224  # px, shorter side of an image for the ImageNet network
+IMAGENET_SIDE = 224  # px, shorter side of an image for the ImageNet network
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 T = TypeVar("T")
 _HASH_SUFFIX = re.compile(r"#[0-9a-f]{12}$")
@@ -196,7 +196,7 @@ class ClipTowers:
 def imagenet_pixels(images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n 3 y x"]:
     """Return the whole image with a shorter side of 224, normalised as for ImageNet."""
     h, w = images.shape[1:3]
-    shape = (_SIDE, int(_SIDE * h / w)) if w <= h else (int(_SIDE * w / h), _SIDE)
+    shape = IMAGENET_SIDE * w // min(h, w), IMAGENET_SIDE * h // min(h, w)
     resized = [Image.fromarray(i).resize(shape, Image.Resampling.BICUBIC) for i in images]
     pixels = torch.tensor(np.stack([np.asarray(image) for image in resized]))
     return imagenet_normalised(pixels.permute(0, 3, 1, 2) / 255)

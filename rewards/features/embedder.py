@@ -216,21 +216,17 @@ class EpisodeEmbedder:
     def embed_cameras(self, frames: Frames) -> Features:
         """Return image, and with parts the pooled features and map of each camera."""
         features: dict[str, np.ndarray] = {}
-        for key in dict.fromkeys((*CAMERAS * self.parts, self.camera)):
-            if (images := frames.get(key)) is None:
-                continue
-            name = camera_name(key) if self.parts else IMAGE
-            if not isinstance(self._towers, OfflineTowers):
+        offline = self._towers if isinstance(self._towers, OfflineTowers) else None
+        others = CAMERAS if self.parts else ()
+        for key in dict.fromkeys(key for key in (*others, self.camera) if key in frames):
+            images = frames[key] if offline is None else steady_images(frames[key])
+            if offline is None or not self.parts:
                 pooled = self._towers.embed_images(images)
-            elif self.parts:
-                pooled, features[map_name(key)] = self._towers.embed_with_maps(
-                    steady_images(images)
-                )
             else:
-                pooled = self._towers.embed_images(steady_images(images))
-            features[name] = _unit(pooled)
-            if key == self.camera:
-                features[IMAGE] = features[name]
+                pooled, features[map_name(key)] = offline.embed_with_maps(images)
+            features[camera_name(key) if self.parts else IMAGE] = _unit(pooled)
+        if self.parts and self.camera in frames:
+            features[IMAGE] = features[camera_name(self.camera)]
         return features
 
     def embed_touch(

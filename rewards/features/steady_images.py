@@ -10,15 +10,17 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from touchgoal.encoders.towers.towers import IMAGENET_SIDE
+
 STEADY = "offline, steady images"  # in an `EmbeddingSource`: the offline towers, of such images
-_SHARP, _SIDE = 128, 224  # px, shorter side: of what is told apart, and of the result
-_SMOOTHING, _GRAIN = 1.0, 4.0  # px of the smaller image; counts, which cover a camera's own
+_SHARP = 128  # px, the shorter side to which an image is shrunk first: finer detail is lost
+_SMOOTHING, _GRAIN = 1.0, 4.0  # standard deviations: px of the shrunk image; counts of 255
 
 
 def steady_images(images: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, "n y x 3"]:
-    """Return images with a shorter side of 224, smoothed, with one and the same grain."""
+    """Return images as large as the network takes them, smoothed, with one and the same grain."""
     h, w = images.shape[1:3]
-    small, size = ((side * w // min(h, w), side * h // min(h, w)) for side in (_SHARP, _SIDE))
+    small, size = ((s * w // min(h, w), s * h // min(h, w)) for s in (_SHARP, IMAGENET_SIDE))
     steady, grain = np.empty((len(images), *size[::-1], 3), np.uint8), _grain(*size)
     for i, image in enumerate(images):
         sharp = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
