@@ -75,14 +75,17 @@ def guess_keys(features: Features) -> dict[str, str]:
         for key in images
         if not is_image(key)
     }
-    touch = [key for key in images if any(name in key.lower() for name in _SENSOR_NAMES)]
-    for side, key in _SIDES.items():
-        found = [stored for stored in touch if side in stored.lower()]
-        if len(touch) == 1 and not any(name in touch[0].lower() for name in _SIDES):
-            found = touch if side == "left" else []
-        if len(found) == 1 and key not in features:
-            guessed[found[0]] = key
-    return guessed
+    sides = guess_sides(images)
+    return guessed | {stored: key for key, stored in sides.items() if key not in features}
+
+
+def guess_sides(images: Sequence[str]) -> dict[str, str]:
+    """Return the name of the images of each fingertip by its key; a single fingertip is the left."""
+    touch = [name for name in images if any(sensor in name.lower() for sensor in _SENSOR_NAMES)]
+    if len(touch) == 1 and not any(side in touch[0].lower() for side in _SIDES):
+        return {TACTILE_LEFT: touch[0]}
+    found = {key: [name for name in touch if side in name.lower()] for side, key in _SIDES.items()}
+    return {key: names[0] for key, names in found.items() if len(names) == 1}
 
 
 def stored_names(root: Path, features: Features, keys: Mapping[str, str]) -> dict[str, str]:

@@ -17,6 +17,7 @@ COMMANDS = {
     "collect-demos": "record an expert's episodes of a task, or failures on purpose",
     "collect-touches": "record touches of objects: the MMWand data set, or slides to learn from without labels",
     "record-demos": "lead an arm or the twin by SpaceMouse or keys, and record demonstrations",
+    "import-demos": "make a set of episodes of HDF5, ROS bags, or videos with a table",
     "annotate": "find and caption the objects that VisGel's recordings touch",
     "train-encoder": "train a touch encoder",
     "train-pose-estimator": "train the network that finds object and goal in a camera image",

@@ -55,9 +55,6 @@ class Config:
     """Measure plain distances of image, touch and text in place of the parts of the cost."""
     plots: CountOrNone = 100
     """Number of trajectories, from the first, that get a plot of their own."""
-    audit: CountOrNone = 0
-    """Number of trajectories, from the first, whose touch is replaced to see if it mattered. They are
-    held in memory; goals must come from other trajectories."""
     ray: str | None = None
     """Address of a Ray cluster whose cores embed trajectories side by side, in place of this process;
     auto: the one started on this machine."""
@@ -70,7 +67,6 @@ class Config:
 def main(config: Config) -> None:
     """Check, measure what is not measured yet, and write the reports."""
     from touchgoal.episodes.keys import parse_keys
-    from touchgoal.rewards.audit import audit_trajectories
     from touchgoal.rewards.goals import Bank, OwnFrame, parse_goal
     from touchgoal.rewards.measure import Measurement, embed_here, embed_on_ray, write_skipped
     from touchgoal.rewards.report.frame_table import FRAMES
@@ -106,8 +102,6 @@ def main(config: Config) -> None:
         notices.append(
             "failures are among the trajectories; with goal last they end at cost 0, too"
         )
-    if config.audit and any(isinstance(spec, OwnFrame) for spec in specs):
-        raise UserError("--audit needs goals from other trajectories: --goal bank:SET, for example")
     first = rewards[source.trajectories[0].name]
     out = open_run(config.out, "reward-curves", config)
     print("\n".join([*notices, first.note]))
@@ -129,8 +123,6 @@ def main(config: Config) -> None:
     summary = write_skipped(skipped, total, out)
     if not measurement.records:
         raise UserError(f"nothing could be measured: {skipped[0].reason}")
-    audited = source.trajectories[: config.audit]
-    audit = audit_trajectories(audited, rewards).table if audited else ""
-    unfit = report_all(measurement.records, out, first.provenance(), audit)
+    unfit = report_all(measurement.records, out, first.provenance())
     print(f"{summary}; {speed}")
     print(unfit or f"next: look at {out / PAGE}; train on {out / FRAMES}")

@@ -272,7 +272,8 @@ class Reward:
             else:
                 found = DistanceNormalizer.load(path)
         if found is not None:
-            unfit = found.mismatch(embedder.made_with, goals, same_episode(goals))
+            own = same_episode(goals)
+            unfit = found.mismatch(embedder.made_with, goals, own, parts=not self._plain)
             if given is None and found.scene != inputs.scene:
                 unfit = (
                     f"it was fitted on {found.scene} episodes and the scene here is {inputs.scene}"

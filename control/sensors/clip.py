@@ -153,8 +153,8 @@ def refuse_other_format(path: Path) -> None:
     for suffixes, signature, name in _FORMATS:
         if path.suffix.lower() in suffixes or begin.startswith(signature):
             raise UserError(
-                f"{path} is {name}, which is not read here: convert it to a LeRobotDataset v3 "
-                "(docs/data_format.md), or its images to videos or folders of PNG files"
+                f"{path} is {name}, which is not read here: touchgoal import-demos {path} makes a set "
+                "of HDF5 and ROS bags; save other images as videos or folders of PNG files"
             )
 
 

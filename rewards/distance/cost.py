@@ -61,7 +61,8 @@ def compute_curves(
     normalised: Costs = {}
     parts: Costs = {}
     if normalizer is not None:
-        normalised = normalizer.normalise(raw, episode.made_with, goal.same_episode)
+        about = episode.made_with, goal.same_episode
+        normalised = normalizer.normalise(raw, *about, parts=bool(units))
     if units:
         parts = part_costs(episode.features, goal.features, units)
         if value is not None:

@@ -88,15 +88,20 @@ class DistanceNormalizer:
     command: str = ""  # that fitted it
 
     def mismatch(
-        self, source: EmbeddingSource, modalities: Iterable[str], same_episode: frozenset[str]
+        self,
+        source: EmbeddingSource,
+        modalities: Iterable[str],
+        same_episode: frozenset[str],
+        parts: bool = False,
     ) -> str | None:
         """Return why such distances cannot be normalised by this; None if they can.
 
         A plain video counts as taken by the camera that the normalizer was fitted on. The goal of a
-        modality in `same_episode` is a frame of the measured episode itself.
+        modality in `same_episode` is a frame of the measured episode itself. With `parts` image and
+        touch need no medians: a hand that lets go ends as it began, and its touch separates nothing.
         """
         names = set(modalities) - {"force"}
-        for m in sorted(names):
+        for m in sorted(names - ({"image", "tactile"} if parts and self.unit else set())):
             if (name := median_name(m, m in same_episode)) not in self.start:
                 return f"it has no '{name}', only {', '.join(self.start)}"
         reason = self.source.mismatch(source, "image" in names, bool(names & {"tactile", "text"}))
@@ -107,19 +112,23 @@ class DistanceNormalizer:
         raw: Mapping[str, Float[np.ndarray, " n"]],
         source: EmbeddingSource,
         same_episode: frozenset[str],
+        parts: bool = False,
     ) -> dict[str, Float[np.ndarray, " n"]]:
         """Return normalised distances by modality, from raw cosine distances; see `mismatch`.
 
-        UserError: a modality that was not fitted, or was fitted for something else.
+        With `parts` a modality without medians is left out. UserError: one that was not fitted, or was
+        fitted for something else.
         """
-        reason = self.mismatch(source, raw, same_episode)
+        reason = self.mismatch(source, raw, same_episode, parts)
         if reason:
             raise UserError(f"this normalizer does not apply: {reason}; {REMEDY}")
         normalised = {}
         for m, d in raw.items():
             name = median_name(m, m in same_episode)
-            start, end = (1.0, 0.0) if m == "force" else (self.start[name], self.goal[name])
-            normalised[m] = (d - end) / (start - end)
+            if m == "force":
+                normalised[m] = d
+            elif name in self.start:
+                normalised[m] = (d - self.goal[name]) / (self.start[name] - self.goal[name])
         return normalised
 
     def save(self, path: Path) -> None:

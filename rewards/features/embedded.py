@@ -42,7 +42,9 @@ ARM = {"wrench": WRENCH, "tcp_pose": TCP_POSE}
 """Parts that the arm measures, and their keys."""
 PUT_DOWN, SCENE_MAP = "put_down", "scene_map"
 """Of goals: whether what was held was put down, (n,); wrist_map of successes with any object."""
-_TOUCHED = (*FINGERTIPS, *ARM, PUT_DOWN)  # parts that the goal of touch sets
+CARRIED = {name: f"carried_{name}" for name in (TOUCH, "held", "slip")}
+"""Of goals whose hands end empty: what successes felt before the put-down, by what it stands for."""
+_TOUCHED = (*FINGERTIPS, *ARM, PUT_DOWN, *CARRIED.values())  # parts that the goal of touch sets
 _MAP = "_map"
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
 from touchgoal.rewards.features import embedded
-from touchgoal.rewards.judging.end_state import put_down
+from touchgoal.rewards.judging.end_state import last_carried, put_down
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
 
@@ -32,8 +32,12 @@ class SuccessfulEnds:
         unread = {name for name in episodes[0].features if name.endswith("_map")} - {"wrist_map"}
         ends = {k: rows for k, rows in embedded.last_rows(episodes).items() if k not in unread}
         if len(episodes[0].features.get("held", ())) > START_FRAMES + 1:
-            down = [put_down(e.features, e.fps) is not None for e in episodes]
-            ends[embedded.PUT_DOWN] = np.array(down)
+            down = [put_down(e.features, e.fps) for e in episodes]
+            ends[embedded.PUT_DOWN] = np.array([row is not None for row in down])
+            if not ends["held"].all(1).any():  # all hands are empty: what they carried was before
+                felt = [embedded.split_features(e.features)[1] for e in episodes]
+                rows = list(map(last_carried, felt, down))
+                ends |= {v: np.concatenate([r[k] for r in rows]) for k, v in embedded.CARRIED.items()}
         return cls(ends, tuple(e.object for e in episodes), episodes[0].made_with)
 
     def for_trajectory(self, own: embedded.EmbeddedEpisode, what: str) -> embedded.Features:

@@ -19,8 +19,15 @@ import numpy as np
 from jaxtyping import Float16
 
 from touchgoal.rewards.curves import UNITS_AT_HALF
-from touchgoal.rewards.distance.parts import VALUE, part_costs, unit_map
+from touchgoal.rewards.distance.parts import (
+    SPREAD_QUANTILE,
+    VALUE,
+    Costs,
+    part_costs,
+    unit_map,
+)
 from touchgoal.rewards.features.embedded import (
+    CARRIED,
     PUT_DOWN,
     SCENE_MAP,
     Features,
@@ -30,7 +37,7 @@ from touchgoal.rewards.features.embedded import (
 )
 from touchgoal.rewards.value import Value
 
-CARRIED = ("object", "slip")
+_CARRIED = ("object", "slip")
 """Parts that are read before the object is put down."""
 RESTING = ("wrist", "held")
 """Parts that are read at the end, beside those above."""
@@ -68,6 +75,12 @@ def put_down(history: Features, fps: float) -> int | None:
     return begin + int(np.argmax(changed)) if changed.any() else None
 
 
+def last_carried(history: Features, before: int | None) -> Features:
+    """Return the last row before the put-down, given its row; the last one of all without a put-down."""
+    at = len(next(iter(history.values()), ())) - 1 if before is None else max(before - 1, 0)
+    return take_rows(history, slice(at, at + 1))
+
+
 def end_costs(
     features: Features, fps: float, goal: Features, units: Mapping[str, float], value: Value | None
 ) -> dict[str, float]:
@@ -83,11 +96,10 @@ def end_costs(
     seen, felt = split_features(features)
     seen, rest = take_rows(seen, slice(-1, None)), take_rows(felt, slice(-1, None))
     before = put_down(felt, fps)
-    at = len(next(iter(felt.values()), ())) - 1 if before is None else max(before - 1, 0)
-    carried = take_rows(felt, slice(at, at + 1))
+    carried = last_carried(felt, before)
     resting = RESTING if "wrist" in goal else (*cameras_of(goal), *RESTING)
     costs = _some(part_costs({**seen, **rest}, goal, units), resting)
-    costs |= _some(part_costs(carried, goal, units), CARRIED)
+    costs |= _some(_carried_costs(carried, goal, units), _CARRIED)
     if value is not None:
         costs[VALUE] = 1 - float(value.progress(seen)[0])
     if "wrist_map" in goal and "wrist_map" in seen:
@@ -106,6 +118,15 @@ def end_cost(costs: Mapping[str, float]) -> float:
         return float(np.sqrt(np.mean(np.concatenate(groups))))
     place, other = map(np.mean, groups)
     return float(np.sqrt(_PLACE_SHARE * place + (1 - _PLACE_SHARE) * other))
+
+
+def _carried_costs(carried: Features, goal: Features, units: Mapping[str, float]) -> Costs:
+    """Return the costs against what successes carried, if their hands are empty at the end."""
+    held = {name: goal[stored] for name, stored in CARRIED.items() if stored in goal}
+    if "slip" in held:
+        slip = float(np.quantile(held["slip"].mean(1), SPREAD_QUANTILE))
+        units = {**units, "slip": max(units["slip"], slip)}
+    return part_costs(carried, {**goal, **held}, units)
 
 
 def _some(costs: Mapping[str, np.ndarray], names: tuple[str, ...]) -> dict[str, float]:

@@ -45,15 +45,10 @@ def write_report(
     return paths
 
 
-def report_all(
-    records: Sequence[Path], out: Path, provenance: Mapping[str, Any], audit: str = ""
-) -> str:
+def report_all(records: Sequence[Path], out: Path, provenance: Mapping[str, Any]) -> str:
     """Write the reports of all records: metrics, tables for LeRobot, pages; print the tables.
 
     Return why the reward is not to be trained on, "" if nothing speaks against it.
-
-    Args:
-        audit: table of the touch-use audit; "" without one.
     """
     facts = [Record.load(path).facts for path in records]
     about = [{"source": f.source, "object": f.object, "outcome": f.outcome} for f in facts]
@@ -64,8 +59,6 @@ def report_all(
     tables = [metrics_table(facts, most=MOST_CURVES), ends_table(facts)]
     if any(one.success is False for one in facts):
         tables.append(outcome_table(facts))
-    if audit:
-        tables.append(audit)
     page = write_pages(records, facts, out, tables[2:])
     print("\n\n".join(tables))
     if not facts[0].normalised:

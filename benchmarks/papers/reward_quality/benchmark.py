@@ -36,7 +36,7 @@ from benchmarks.papers.reward_quality.recording import (
     plan,
     record,
 )
-from touchgoal.rewards.audit import audit_touch
+from benchmarks.papers.reward_quality.touch_audit import audit_touch
 from touchgoal.rewards.report.tables import metrics_table
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig

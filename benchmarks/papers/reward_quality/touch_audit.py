@@ -5,7 +5,7 @@ paired by episode, their intervals a bootstrap over episodes. The goal must not 
 episode itself: against its own end every replacement costs more, even if touch is useless.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -14,14 +14,9 @@ from jaxtyping import Float
 
 from touchgoal.encoders.probes.bootstrap import mean_interval, percentile_interval
 from touchgoal.rewards.curves import FUSED, Curves
-from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.features.embedded import FINGERTIPS, TOUCH, EmbeddedEpisode, EmbeddedGoal
-from touchgoal.rewards.features.embedding_cache import embed_trajectory
 from touchgoal.rewards.metrics import auc, measure_curve
-from touchgoal.rewards.prepared_reward import PreparedReward
-from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.progress import track
 
 REPLACEMENTS = ("neutral", "shuffled", "shifted", "mirrored", "another's")
 """Touch of an episode in place of its own: as in its first frame all the time, its frames in random
@@ -115,16 +110,14 @@ def audit_touch(
         raise UserError(f"an audit of touch needs at least two episodes, not {len(episodes)}")
     for episode, goal in zip(episodes, goals, strict=True):
         if TOUCH not in episode.features:
-            raise UserError(f"{episode.source} has no touch to audit: leave --audit out")
+            raise UserError(f"{episode.source} has no touch to audit")
         if goal.same_episode:
             raise UserError(
                 f"the goal of {episode.source} is a frame of itself, so the audit of touch proves "
                 "nothing: give the end of another episode, or a bank of them"
             )
     if FUSED not in measure(episodes[0], goals[0]).costs:
-        raise UserError(
-            "an audit of touch needs the fused cost: give a --normalizer with units, and leave --plain out"
-        )
+        raise UserError("an audit of touch needs the fused cost: give a --normalizer with units")
     real = _measured(episodes, goals, measure)
     rng, replaced = np.random.default_rng(0), {}
     for name in REPLACEMENTS:
@@ -135,23 +128,6 @@ def audit_touch(
     pairs = product(metrics, REPLACEMENTS)
     rows = [_row(metric, name, real, replaced[name], failed) for metric, name in pairs]
     return AuditTable(tuple(rows), len(episodes))
-
-
-def audit_trajectories(
-    trajectories: Sequence[Trajectory], rewards: Mapping[str, PreparedReward]
-) -> AuditTable:
-    """Embed trajectories and audit their touch by the reward of each name; see `audit_touch`."""
-    embedded, goals = [], []
-    for trajectory in track(trajectories, "auditing", "trajectory"):
-        reward = rewards[trajectory.name]
-        embedded.append(embed_trajectory(reward.embedder, trajectory))
-        goals.append(reward.embedder.embed_goal(reward.goals, embedded[-1]))
-    reward = rewards[trajectories[0].name]
-
-    def measure(episode: EmbeddedEpisode, goal: EmbeddedGoal) -> Curves:
-        return compute_curves(episode, goal, reward.normalizer, reward.value, plain=reward.plain)
-
-    return audit_touch(embedded, goals, measure)
 
 
 def _replace(

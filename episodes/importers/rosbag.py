@@ -1,0 +1,151 @@
+"""Recordings of ROS: a rosbag2 folder, an MCAP or .db3 file, a bag of ROS 1. One bag is one episode.
+
+A stream is called as its topic; joint states are three, TOPIC.position, .velocity and .effort. A sample's
+time is the message's own (`header.stamp`), else that of its recording.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from touchgoal.episodes.importers.streams import Recording, Stream, held
+from touchgoal.runtime.errors import UserError, install_extra
+from touchgoal.runtime.image_file import decode_image
+
+SUFFIXES = (".bag", ".db3", ".mcap")
+_TO_RGB = {
+    "rgb8": None,
+    "bgr8": cv2.COLOR_BGR2RGB,
+    "rgba8": cv2.COLOR_RGBA2RGB,
+    "bgra8": cv2.COLOR_BGRA2RGB,
+    "mono8": cv2.COLOR_GRAY2RGB,
+}
+_XYZ = ("x", "y", "z")
+_POSE = tuple(f"position.{n}" for n in _XYZ) + tuple(f"orientation.{n}" for n in (*_XYZ, "w"))
+_WRENCH = tuple(f"force.{n}" for n in _XYZ) + tuple(f"torque.{n}" for n in _XYZ)
+_MOVED = tuple(
+    n.replace("position", "translation").replace("orientation", "rotation") for n in _POSE
+)
+_FIELDS = {  # by the end of the message type: numbers in the message, and how their components are called
+    "/PoseStamped": ("pose", _POSE),
+    "/Pose": ("", _POSE),
+    "/TransformStamped": ("transform", _MOVED),
+    "/WrenchStamped": ("wrench", _WRENCH),
+    "/Wrench": ("", _WRENCH),
+}
+_SCALARS = ("/Float32", "/Float64", "/Int32", "/Int64", "/Bool")
+_ARRAYS = ("/Float32MultiArray", "/Float64MultiArray")
+_PICTURES = ("/Image", "/CompressedImage")
+
+
+def read_bag(path: Path) -> Recording:
+    """Read what a bag holds: numbers at once, images when they are asked for.
+
+    UserError: no bag, or nothing in it that can be read.
+    """
+    times: dict[str, list[float]] = defaultdict(list)
+    values: dict[str, list[np.ndarray]] = defaultdict(list)
+    names: dict[str, tuple[str, ...]] = {}
+    shapes: dict[str, tuple[int, ...]] = {}
+    for topic, kind, stamp, message in _messages(path):
+        if kind.endswith(_PICTURES):
+            if topic not in shapes and (image := _image(message, topic)) is not None:
+                shapes[topic] = image.shape
+            times[topic].append(stamp)
+            continue
+        for name, (numbers, parts) in _numbers(topic, kind, message).items():
+            times[name].append(stamp)
+            values[name].append(numbers)
+            names[name] = parts
+    streams = {}
+    for name, of_name in times.items():
+        order = np.argsort(of_name, kind="stable")
+        at = np.array(of_name)[order]
+        if name in shapes:
+            read = partial(_read_images, path, name, order)
+            streams[name] = Stream(at, shapes[name], read)
+        elif (
+            len({v.shape for v in values[name]}) == 1
+        ):  # not of a joint state that changes its joints
+            rows = np.stack(values[name])[order]
+            streams[name] = Stream(at, rows.shape[1:], held(rows), names[name])
+    if not streams:
+        raise UserError(f"{path} holds no images, joint states, poses, wrenches or numbers")
+    return Recording(path.stem, streams)
+
+
+def _messages(path: Path, only: str = "") -> Iterator[tuple[str, str, float, Any]]:
+    """Yield topic, type, time (s) and message of what is read, in the order of the recording."""
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise UserError(f"{path.name} needs {install_extra('import')}") from None
+    usual = get_typestore(Stores.ROS2_HUMBLE)  # of bags without definitions, such as older rosbag2
+    try:
+        with AnyReader([path], default_typestore=usual) as reader:
+            wanted = [
+                c
+                for c in reader.connections
+                if (c.topic == only or not only) and _is_read(c.msgtype)
+            ]
+            for link, logged, data in reader.messages(wanted) if wanted else ():
+                message = reader.deserialize(data, link.msgtype)
+                stamp = getattr(getattr(message, "header", None), "stamp", None)
+                own = stamp.sec + 1e-9 * stamp.nanosec if stamp is not None else 0.0
+                yield link.topic, link.msgtype, own or 1e-9 * logged, message
+    except AnyReaderError as error:
+        raise UserError(f"{path} cannot be read as a bag: {error}") from error
+
+
+def _is_read(kind: str) -> bool:
+    return kind.endswith((*_FIELDS, *_SCALARS, *_ARRAYS, *_PICTURES, "/JointState"))
+
+
+def _numbers(topic: str, kind: str, message: Any) -> dict[str, tuple[np.ndarray, tuple[str, ...]]]:
+    """Return the numbers of a message by stream, with the names of the components."""
+    if kind.endswith("/JointState"):
+        joints = tuple(message.name)
+        parts = {
+            n: np.array(getattr(message, n), float) for n in ("position", "velocity", "effort")
+        }
+        return {f"{topic}.{n}": (v, joints) for n, v in parts.items() if len(v)}
+    if kind.endswith(_SCALARS):
+        return {topic: (np.array([message.data], float), ())}
+    if kind.endswith(_ARRAYS):
+        return {topic: (np.array(message.data, float), ())}
+    inside, parts = next(v for end, v in _FIELDS.items() if kind.endswith(end))
+    part = getattr(message, inside) if inside else message
+    return {topic: (np.array([attrgetter(name)(part) for name in parts]), parts)}
+
+
+def _image(message: Any, topic: str) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Return a message's image, RGB; None if it is none of 8 bits."""
+    if not hasattr(message, "encoding"):
+        return decode_image(bytes(message.data), topic)
+    if message.encoding not in _TO_RGB:
+        return None
+    rows = np.asarray(message.data).reshape(message.height, message.step)
+    channels = {"mono8": 1, "rgb8": 3, "bgr8": 3}.get(message.encoding, 4)
+    image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
+    change: Callable = partial(cv2.cvtColor, code=_TO_RGB[message.encoding] or 0)
+    return np.ascontiguousarray(image) if message.encoding == "rgb8" else change(image)
+
+
+def _read_images(
+    path: Path, topic: str, order: np.ndarray, rows: np.ndarray
+) -> UInt8[np.ndarray, "k h w 3"]:
+    wanted, found = set(order[rows].tolist()), {}
+    for number, (_, _, _, message) in enumerate(_messages(path, topic)):
+        if number in wanted and (image := _image(message, topic)) is not None:
+            found[number] = image
+        elif number in wanted:
+            raise UserError(f"{path}: image {number} of {topic} cannot be decoded")
+    return np.stack([found[number] for number in order[rows].tolist()])
