@@ -37,7 +37,6 @@ COMMANDS = {
     "push": "upload an encoder or a policy to the Hugging Face Hub",
     "pull": "download one from the Hugging Face Hub and check it",
     "repair": "check a set of episodes and mend what an interruption left",
-    "completion": "print a script that completes commands and options in a shell",
 }
 
 

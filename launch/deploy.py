@@ -146,15 +146,11 @@ def _deploy(
     stream: "BackgroundStream | None",
 ) -> "Result":
     from touchgoal.control.deployment.actors import make_actor
-    from touchgoal.control.deployment.control_loop import Request
     from touchgoal.control.deployment.session import Session
     from touchgoal.control.deployment.terminal import HELP, Terminal
     from touchgoal.control.features import CONTROL_HZ
     from touchgoal.episodes.episode_recorder import EpisodeRecorder
     from touchgoal.launch.support.cell_run import check_cell, confirm
-
-    def request() -> Request:
-        return terminal.operator_request() or ("failed" if cost and cost.failed else "")
 
     def on_tick(status: "TickStatus") -> None:
         terminal.show_tick(status)
@@ -173,7 +169,7 @@ def _deploy(
         recorder=EpisodeRecorder(episodes, CONTROL_HZ),
         execute=config.execute,
         make_actor=lambda loop: make_actor(cell, policy, safety, connection.truth, loop.commanded),
-        operator_request=request,
+        operator_request=terminal.operator_request,
         on_tick=on_tick,
         cost=cost,
         camera_size=camera_size,

@@ -1,9 +1,9 @@
 """Make a set of episodes of recordings in other formats: HDF5, ROS bags, or videos with a table.
 
 HDF5 is read as robomimic writes it (many episodes a file) or as ALOHA does (one a file); of ROS, rosbag2
-folders, MCAP files and bags of ROS 1; else folders with an episode's videos and one CSV table. The command
-proposes which stream becomes what, in which order, unit and rate; look at it, and confirm, or edit the
-map that it wrote and give it by --map. Recordings that do not fit are left out and named.
+folders, MCAP files and bags of ROS 1; else folders with an episode's videos and one CSV table. The first
+call proposes a map, which stream becomes what, in which order, unit and rate, and writes it to a file. Look
+at it, mend it, and call again with --map. Recordings that do not fit are left out and named.
 """
 
 from pathlib import Path
@@ -21,69 +21,51 @@ class Config:
 
     source: Annotated[Path, tyro.conf.Positional]
     """File of recordings, or folder of them."""
-    task: str
-    """Task in words, such as "put the cup on the plate"."""
     map: Path | None = None
     """Map of streams to features, as this command writes it; default: one is proposed."""
-    sensor: str = ""
-    """Name of the fingertip sensor; see touchgoal list sensors."""
     fps: Count | None = None
-    """Frames per second of the set. Default: the recording's, at most 20."""
-    success: bool = False
-    """All recordings are successes; default: as they tell themselves, if they do."""
-    yes: bool = False
-    """Do not ask whether the map is right."""
+    """Frames per second of recordings that do not tell it, and of the set that is proposed. Default: the
+    recording's, at most 20."""
     out: Path | None = None
     """Folder of the run; the episodes go to its `episodes/`."""
 
 
 def main(config: Config) -> None:
-    """Propose, ask, convert one recording after the other."""
+    """Propose a map, or convert one recording after the other by a given one."""
     from touchgoal.control.cell.config_file import read_config
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.episodes.importers.feature_map import FeatureMap, propose_map
     from touchgoal.episodes.importers.find_recordings import find_recordings
-    from touchgoal.episodes.schema import Episode, MetaValue
     from touchgoal.episodes.store import EpisodeWriter
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.progress import track
     from touchgoal.runtime.run_folder import open_run
 
-    if config.sensor:
-        find_sensor(config.sensor)
-    found = find_recordings(config.source, config.fps)
-    chosen = read_config(config.map, FeatureMap, "map") if config.map else None
-    first = found[0]()
-    chosen = chosen or propose_map(first, config.fps)
+    found, again = (
+        find_recordings(config.source, config.fps),
+        f"touchgoal import-demos {config.source}",
+    )
+    if config.map is None:
+        first, path = found[0](), Path(f"{config.source.stem}_map.json")
+        if path.exists():
+            raise UserError(f"{path} exists: give it by --map, or remove it")
+        write_json(path, chosen := propose_map(first, config.fps))
+        print(f"{chosen.table(first)}\nwritten to {path}; if it is right: {again} --map {path}")
+        return
+    chosen = read_config(config.map, FeatureMap, "map")
+    if not chosen.task:
+        raise UserError(f"{config.map}: say in task, in words, what is done")
+    if chosen.feels:
+        find_sensor(chosen.sensor or "")
     out = open_run(config.out, "import-demos", config)
-    write_json(out / "map.json", chosen)
-    print(chosen.table(first))
-    if not (config.map or config.yes):
-        if input("is this right? y and Enter: import; Enter alone: end > ").strip().lower() != "y":
-            print(f"edit {out / 'map.json'} and give it by --map")
-            return
     writer, left = EpisodeWriter(out / "episodes", chosen.fps), []
     for read in track(found, "importing", "episode"):
         try:
-            recording = read()
-            success = True if config.success else recording.success
-            meta: dict[str, MetaValue] = {"task": config.task, "sensor": config.sensor}
-            meta |= {"source": recording.name} | ({} if success is None else {"success": success})
-            writer.append(Episode(chosen.frames(recording), config.task, meta))
+            writer.append(chosen.episode(read()))
         except UserError as error:
-            left.append(str(error))
+            left.append(f"left out: {error}")
     writer.close()
-    print(
-        "\n".join(
-            [
-                *(f"left out: {reason}" for reason in left),
-                f"{len(writer)} episodes: {out / 'episodes'}",
-            ]
-        )
-    )
+    print("\n".join([*left, f"{len(writer)} episodes: {out / 'episodes'}"]))
     if not len(writer):
-        raise UserError("no recording fits the map: edit map.json and give it by --map")
-    print(
-        f"next: touchgoal train-policy --data {out / 'episodes'}"
-        + " --include-unknown" * (success is None)
-    )
+        raise UserError(f"no recording fits {config.map}: mend it")
+    print(f"next: touchgoal train-policy --data {out / 'episodes'}")

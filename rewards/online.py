@@ -177,24 +177,21 @@ def _joint_speed(tick: ft.Observation) -> float:
 class OnlineCost:
     """Measures the newest tick in a thread, whenever the one before is done."""
 
-    def __init__(self, meter: CostMeter, give_up: float = 0.0, time_waits: bool = False) -> None:
+    def __init__(self, meter: CostMeter, time_waits: bool = False) -> None:
         """Start the thread; `close` ends it.
 
         Args:
             meter: measures the run.
-            give_up: rise of the cost that is a failure; 0: none.
             time_waits: wait for the meter rather than leave out ticks that a judge needs.
         """
-        self._meter, self._rise, self._waits = meter, give_up or float("inf"), time_waits
-        self.failed = False  # whether the cost has risen by `give_up` for 20 measurements
+        self._meter, self._waits = meter, time_waits
         self._begun = False
         self._measuring = Lock()
         self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)
 
     def begin(self, observation: ft.Observation) -> None:
         """See Cost; the first measurement warms up the networks."""
-        self.failed = self._begun = False
-        self._watch, self._watched = FailureWatch(self._rise, ft.CONTROL_HZ), time.monotonic()
+        self._begun = False
         self._meter.forget()
         self._meter.add(observation)
 
@@ -214,11 +211,7 @@ class OnlineCost:
 
         It is normalised, or the cosine distance without a normalizer.
         """
-        reading = self._latest.read()
-        if reading.stamp > self._watched:
-            self._watched = reading.stamp
-            self.failed |= self._watch.update(reading.cost)
-        return reading
+        return self._latest.read()
 
     def judge(self) -> CostReading:
         """See Cost."""
@@ -241,25 +234,6 @@ class OnlineCost:
         if reading is None:
             time.sleep(_IDLE_SLEEP)
         return reading
-
-
-class FailureWatch:
-    """Watches the cost of a run, measurement by measurement.
-
-    The run has failed once the cost has stayed `rise` above its lowest value so far for `n`
-    measurements in a row: an object lost, or carried away from its goal. A run that gets nowhere
-    keeps its cost and is left to its time limit.
-    """
-
-    def __init__(self, rise: float, n: int) -> None:
-        self._rise, self._n = rise, n
-        self._lowest, self._above = float("inf"), 0
-
-    def update(self, cost: float) -> bool:
-        """Take the next cost; return whether the run has failed."""
-        self._lowest = min(self._lowest, cost)
-        self._above = self._above + 1 if cost > self._lowest + self._rise else 0
-        return self._above >= self._n
 
 
 def load_cell_cost(cell: CellConfig) -> OnlineCost:
@@ -287,4 +261,4 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
         )
     item = task.objects[0] if len(task.objects) == 1 else ""
     meter = CostMeter(reward.prepare(inputs), item, judges=bool(task.judge))
-    return OnlineCost(meter, task.give_up, cell.time_waits)
+    return OnlineCost(meter, cell.time_waits)

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from benchmarks.papers.reward_quality.touch_audit import REPLACEMENTS, audit_touch
 
+from benchmarks.papers.reward_quality.touch_audit import REPLACEMENTS, audit_touch
 from touchgoal.rewards.curves import Contact, Curves
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal

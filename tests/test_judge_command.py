@@ -10,7 +10,15 @@ import pytest
 from test_episode_embedder import embedder, recorded  # noqa: F401
 from test_reward_parts import embedded
 
-from touchgoal.control.features import FRONT, TACTILE_LEFT, TCP_POSE, WRENCH, WRIST
+from touchgoal.control.features import (
+    FRONT,
+    TACTILE_LEFT,
+    TACTILE_RIGHT,
+    TCP_POSE,
+    TRUTH_CONTACT,
+    WRENCH,
+    WRIST,
+)
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
@@ -62,6 +70,25 @@ def test_an_end_is_judged_alike_from_less(embedder: EpisodeEmbedder, tmp_path: P
     assert {k: len(v) for k, v in of_less.items()} == dict.fromkeys(ends, 1)
     for one in (less, again):
         assert end_costs(one.features, 20, goal, units, None) == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_hand_that_lets_go_is_judged_by_what_it_carried(embedder: EpisodeEmbedder) -> None:  # noqa: F811
+    """Empty hands are alike at the end: what they carried, and how it slipped, is read before."""
+    kept = carried()
+    frames = {key: values.copy() for key, values in kept.frames.items()}
+    for key in (TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT):
+        frames[key][36:] = frames[key][0]
+    other = {**frames, TACTILE_LEFT: np.roll(frames[TACTILE_LEFT], 60, axis=2)}
+    let_go, holds, wrong = (
+        embedder.embed_episode(replace(kept, frames=f), 20, "one")
+        for f in (frames, kept.frames, other)
+    )
+    ends = SuccessfulEnds.of([let_go, let_go]).features
+    assert "carried_touch" in ends and "carried_touch" not in SuccessfulEnds.of([holds]).features
+    units = {"object": 1e-5, "slip": 2e-4, "held": 0.3}
+    right, off = (end_costs(e.features, 20, ends, units, None) for e in (let_go, wrong))
+    assert right["object"] == pytest.approx(0, abs=1e-6) and right["slip"] < 0.35
+    assert off["object"] > 0.5 and right["held"] == off["held"] == 0
 
 
 def test_fitted_judged_and_corrected(

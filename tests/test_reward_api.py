@@ -1,9 +1,6 @@
 """One object measures arrays, sets and runs; what is checked before any encoder is loaded."""
 
 import json
-import threading
-import time
-from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +22,6 @@ from touchgoal.control.features import (
     TRUTH_CONTACT,
     TRUTH_START,
 )
-from touchgoal.control.interfaces import CostReading
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
@@ -261,42 +257,6 @@ def test_cost_during_a_run_is_raw_without_normalizer(encoder: TouchEncoder) -> N
         meter_of(encoder, None, IMAGES[9], "soft")
     with pytest.raises(UserError, match="not known before the end"):
         meter_of(encoder, None, "last")
-
-
-class Rising(CostMeter):
-    """A meter of a cost that rises at the second measurement, after which it hangs until it may go on."""
-
-    judges = False
-
-    def __init__(self) -> None:
-        self.waiting, self.costs, self.may_go_on = deque(maxlen=1), [0.1, 0.9], threading.Event()
-
-    def measure(self) -> CostReading | None:
-        if not self.waiting:
-            return None
-        stamp = self.waiting.pop()[0]
-        cost = self.costs.pop(0) if self.costs else self.may_go_on.wait() * 0.9
-        return CostReading(cost, stamp)
-
-
-def test_one_high_cost_and_a_meter_that_hangs_are_no_failed_run() -> None:
-    meter, tick = Rising(), {FRONT: IMAGES[0]}
-    cost = OnlineCost(meter, give_up=0.3)
-    cost.begin(tick)
-    assert cost.read().cost == 0.1
-    high = None
-    for _ in range(100):
-        cost.hand_over(tick)
-        high = cost.read() if cost.read().cost == 0.9 else high
-        time.sleep(0.002)
-    assert high is not None and cost.read() == high and not cost.failed
-    meter.may_go_on.set()
-    for _ in range(500):
-        cost.hand_over(tick)
-        cost.read()
-        time.sleep(0 if cost.failed else 0.01)
-    assert cost.failed and cost.read().stamp > high.stamp
-    cost.close()
 
 
 def meter_of(

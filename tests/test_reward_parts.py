@@ -31,7 +31,6 @@ from touchgoal.rewards.features.embedded import (
     take_rows,
 )
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
-from touchgoal.rewards.online import FailureWatch
 from touchgoal.rewards.reward import Reward
 from touchgoal.rewards.reward_wrapper import RewardWrapper
 from touchgoal.rewards.value import Value, fit_value
@@ -310,9 +309,3 @@ def test_the_cost_rewards_an_environment() -> None:
     assert steps[-1][-1]["task_reward"] == 7.0
     with pytest.raises(UserError, match="not known before the end"):
         RewardWrapper(env, Reward(towers=PaintTowers(), normalizer="none"))
-
-
-def test_a_run_whose_cost_has_risen_for_a_second_has_failed() -> None:
-    watch = FailureWatch(0.3, n=3)
-    falling, bump, lost = [0.9, 0.6, 0.4], [0.8, 0.8, 0.4], [0.75, 0.75, 0.75]
-    assert [watch.update(c) for c in (*falling, *bump, *lost)] == [*[False] * 8, True]

@@ -181,9 +181,6 @@ class TaskSection:
     """Folder of fit-normalizer --judge, or gelsight_mini for the one that ships, in place of `rewards` and
     `normalizer`: its judge ends the run, and says at its end whether the task is done, in place of a
     simulator."""
-    give_up: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
-    """Rise of that distance above its lowest value that ends the run as failed, if it lasts a second; 0:
-    never."""
 
     @property
     def own(self) -> bool:

@@ -82,7 +82,7 @@ class Ending:
         return f"STOPPED: {self.reason}\n  the arm: {rest}\n  what to do: {self.advice}"
 
 
-Request = Literal["", "stop", "done", "not done", "discard", "success", "failed"]
+Request = Literal["", "stop", "done", "not done", "discard", "success"]
 """Operator's request: go on, stop the arm, end with the task done or not, or without a record;
 success: a simulator's; failed: the cost's."""
 PLAN_ENDED, TIME_UP = "the plan is through", "time is up"
@@ -93,7 +93,6 @@ _REQUESTED_ENDINGS: dict[Request, Ending] = {
     "not done": Ending("the operator says that the task is not done", done=False),
     "discard": Ending(DISCARDED),
     "success": Ending("the simulator says that the task is done", done=True),
-    "failed": Ending("the cost has risen and stays: the policy has failed", done=False),
 }
 
 

@@ -6,15 +6,15 @@ at its time, nothing from later.
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field, replace
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.importers.streams import Recording, Stream
+from touchgoal.episodes.importers.streams import RawEpisode, Stream
 from touchgoal.episodes.keys import guess_sides
-from touchgoal.episodes.schema import is_image
+from touchgoal.episodes.schema import Episode, MetaValue, is_image
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, checked_dataclass
 
@@ -47,8 +47,23 @@ class FeatureMap:
     features: dict[str, tuple[Part, ...]] = field(default_factory=dict)
     """Key of touchgoal -> its parts. Without `action`, it is what the joints and the gripper do in the next
     tick."""
+    task: str | None = None
+    """Task in words, such as "put the cup on the plate"."""
+    sensor: str | None = None
+    """Name of the fingertip sensor; see touchgoal list sensors."""
 
-    def frames(self, recording: Recording) -> dict[str, Shaped[np.ndarray, "t ..."]]:
+    @property
+    def feels(self) -> bool:
+        """Whether fingertips are among the features."""
+        return not self.features.keys().isdisjoint(ft.TACTILE)
+
+    def episode(self, recording: RawEpisode) -> Episode:
+        """Return an episode, marked as a success unless the recording knows better; see `frames`."""
+        meta: dict[str, MetaValue] = {"task": self.task or "", "source": recording.name}
+        meta |= {"sensor": self.sensor or "", "success": recording.success is not False}
+        return Episode(self.frames(recording), self.task or "", meta)
+
+    def frames(self, recording: RawEpisode) -> dict[str, Shaped[np.ndarray, "t ..."]]:
         """Return the frames of an episode, from the time at which every stream has begun.
 
         UserError: a stream is missing, pauses, or does not fit its key.
@@ -76,7 +91,7 @@ class FeatureMap:
             frames[ft.ACTION] = _next_motion(frames[ft.STATE])
         return frames
 
-    def table(self, recording: Recording) -> str:
+    def table(self, recording: RawEpisode) -> str:
         """Return what becomes of a recording's streams, with ranges after scaling, for people."""
         lines = [f"{recording.name}, {self.fps} frames a second:"]
         for key, parts in self.features.items():
@@ -98,7 +113,7 @@ class FeatureMap:
         return "\n".join([*lines, f"  left out: {', '.join(left)}"] if left else lines)
 
 
-def propose_map(recording: Recording, fps: int | None = None) -> FeatureMap:
+def propose_map(recording: RawEpisode, fps: int | None = None) -> FeatureMap:
     """Guess a map from names, shapes and ranges; a person confirms it.
 
     `fps`: default that of the slowest images, at most 20. UserError: neither joints nor images.
@@ -112,7 +127,9 @@ def propose_map(recording: Recording, fps: int | None = None) -> FeatureMap:
         raise UserError(f"{recording.name} holds neither images nor joint positions")
     used = [streams[p.stream] for parts in features.values() for p in parts]
     slowest = min(1 / np.median(np.diff(s.times)) for s in used if len(s.times) > 1)
-    return FeatureMap(fps or max(1, min(ft.CONTROL_HZ, round(slowest))), features)
+    digit = any("digit" in p.stream.lower() for parts in features.values() for p in parts)
+    found = FeatureMap(fps or max(1, min(ft.CONTROL_HZ, round(slowest))), features)
+    return replace(found, sensor=("digit" if digit else "gelsight_mini") if found.feels else None)
 
 
 def _newest(stream: Stream, at: Float[np.ndarray, " t"], name: str) -> Int[np.ndarray, " t"]:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 from touchgoal.control.sensors.clip import in_natural_order
 from touchgoal.episodes.importers import hdf5, rosbag, video_table
-from touchgoal.episodes.importers.streams import Recording
+from touchgoal.episodes.importers.streams import RawEpisode
 from touchgoal.runtime.errors import UserError
 
 _HDF5 = (".hdf5", ".h5")
 
 
-def find_recordings(source: Path, fps: float | None) -> list[Callable[[], Recording]]:
+def find_recordings(source: Path, fps: float | None) -> list[Callable[[], RawEpisode]]:
     """Return what reads each recording, in natural order; `fps` for those that do not tell their rate.
 
     UserError: there is none.
@@ -28,7 +28,7 @@ def find_recordings(source: Path, fps: float | None) -> list[Callable[[], Record
     return found
 
 
-def _recordings(path: Path, fps: float | None) -> list[Callable[[], Recording]]:
+def _recordings(path: Path, fps: float | None) -> list[Callable[[], RawEpisode]]:
     if path.suffix.lower() in _HDF5:
         return hdf5.find_episodes(path, fps)
     if path.suffix.lower() in rosbag.SUFFIXES or (path / "metadata.yaml").is_file():

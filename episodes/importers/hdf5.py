@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.episodes.importers.streams import Recording, Stream
+from touchgoal.episodes.importers.streams import RawEpisode, Stream
 from touchgoal.runtime.errors import UserError, install_extra
 
 
-def find_episodes(path: Path, fps: float | None) -> list[Callable[[], Recording]]:
+def find_episodes(path: Path, fps: float | None) -> list[Callable[[], RawEpisode]]:
     """Return what reads each episode of a file, in natural order; `fps` if the file does not tell its rate.
 
     UserError: no HDF5, or no rate.
@@ -34,7 +34,7 @@ def find_episodes(path: Path, fps: float | None) -> list[Callable[[], Recording]
     return [partial(_recording, path, name, rate, sparse) for name in names]
 
 
-def _recording(path: Path, group: str, rate: float, sparse: bool) -> Recording:
+def _recording(path: Path, group: str, rate: float, sparse: bool) -> RawEpisode:
     """Read an episode; with a `sparse` reward, one above 0 is a success. UserError: no data."""
     sizes: dict[str, tuple[int, ...]] = {}
 
@@ -60,7 +60,7 @@ def _recording(path: Path, group: str, rate: float, sparse: bool) -> Recording:
             )
     success = None if rewards is None else bool((rewards > 0).any())  # a sparse reward
     of_file = path.stem if group == "/" else f"{path.stem}/{group.removeprefix('data/')}"
-    return Recording(of_file, streams, success)
+    return RawEpisode(of_file, streams, success)
 
 
 def _is_read(shape: list[int]) -> bool:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.episodes.importers.streams import Recording, Stream, held
+from touchgoal.episodes.importers.streams import RawEpisode, Stream, held
 from touchgoal.runtime.errors import UserError, install_extra
 from touchgoal.runtime.image_file import decode_image
 
@@ -45,7 +45,7 @@ _ARRAYS = ("/Float32MultiArray", "/Float64MultiArray")
 _PICTURES = ("/Image", "/CompressedImage")
 
 
-def read_bag(path: Path) -> Recording:
+def read_bag(path: Path) -> RawEpisode:
     """Read what a bag holds: numbers at once, images when they are asked for.
 
     UserError: no bag, or nothing in it that can be read.
@@ -78,7 +78,7 @@ def read_bag(path: Path) -> Recording:
             streams[name] = Stream(at, rows.shape[1:], held(rows), names[name])
     if not streams:
         raise UserError(f"{path} holds no images, joint states, poses, wrenches or numbers")
-    return Recording(path.stem, streams)
+    return RawEpisode(path.stem, streams)
 
 
 def _messages(path: Path, only: str = "") -> Iterator[tuple[str, str, float, Any]]:

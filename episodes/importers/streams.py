@@ -24,7 +24,7 @@ class Stream:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class RawEpisode:
     """One episode, as it was recorded."""
 
     name: str

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from touchgoal.control.sensors.clip import Clip, open_clip
-from touchgoal.episodes.importers.streams import Recording, Stream, held
+from touchgoal.episodes.importers.streams import RawEpisode, Stream, held
 from touchgoal.runtime.errors import UserError
 
 _VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
@@ -27,7 +27,7 @@ def is_video_table(folder: Path) -> bool:
     return len(list(folder.glob("*.csv"))) == 1 and bool(_videos(folder))
 
 
-def read_video_table(folder: Path) -> Recording:
+def read_video_table(folder: Path) -> RawEpisode:
     """Read the table; videos are read when they are asked for.
 
     UserError: no column of times, or something that is no number.
@@ -54,7 +54,7 @@ def read_video_table(folder: Path) -> Recording:
         clip = open_clip(path)
         at = times[0] + np.arange(clip.length) / (clip.fps or 1.0)
         streams[path.stem] = Stream(at, (*clip.shape, 3), partial(_frames, clip))
-    return Recording(folder.name, streams)
+    return RawEpisode(folder.name, streams)
 
 
 def _videos(folder: Path) -> list[Path]:

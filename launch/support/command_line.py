@@ -263,15 +263,3 @@ def _point_to_other_task(
         owners = [task for task, other in envs.items() if hasattr(other, field)]
         if argument.startswith("--env.") and owners and not hasattr(env, field):
             raise UserError(f"{argument} is an option of the task {owners[0]}: --task {owners[0]}")
-
-
-def print_completion(config_type: Any, shell: str) -> None:
-    """Print a script that completes the arguments of `touchgoal` in a shell."""
-    registry = ConstructorRegistry()
-    registry.struct_rule(partial(_as_options, env=None, hidden=set()))
-    try:
-        written = ["--tyro-write-completion", shell, "-"]
-        tyro.cli(config_type, args=written, prog="touchgoal", registry=registry)
-    except SystemExit as stop:
-        if stop.code:
-            raise

@@ -15,7 +15,6 @@ import numpy as np
 from benchmarks.options import CORES, BenchmarkOptions
 from benchmarks.papers.reward_quality import tables
 from benchmarks.papers.reward_quality.claims import judge_claims
-from benchmarks.papers.reward_quality.early_stopping import judge_stopping, stopping_text
 from benchmarks.papers.reward_quality.embedding import EmbeddedFiles
 from benchmarks.papers.reward_quality.judging import Judge, fit_judge
 from benchmarks.papers.reward_quality.measures import (
@@ -106,8 +105,6 @@ def _judge_scene(judge: Judge, recorded: Sequence[Recorded]) -> tuple[dict[str, 
         for outcome, episodes in judged.items()
     }
     margins = _margins(judge, test, curves)
-    demonstrations = judge.judge([r for r in recorded if r.purpose == "calibration"])
-    stopping = judge_stopping(demonstrations, judged, judge.files.load(test[0]).fps)
     audited = [r for r in test if r.outcome in _AUDITED]
     audit = audit_touch(
         [judge.files.load(r) for r in audited],
@@ -123,7 +120,6 @@ def _judge_scene(judge: Judge, recorded: Sequence[Recorded]) -> tuple[dict[str, 
             tables.grid("rank correlation of falling cost with time", ranks),
             tables.intervals(found | ordered, curves),
             tables.diagonals(margins),
-            stopping_text(stopping),
             audit.table,
             text,
         ]
@@ -134,7 +130,6 @@ def _judge_scene(judge: Judge, recorded: Sequence[Recorded]) -> tuple[dict[str, 
         "order": tables.as_json(ordered),
         "rank": tables.as_json(ranks),
         "diagonal": margins,
-        "early_stopping": stopping,
         "audit": {"verdict": audit.verdict, "rows": [vars(row) for row in audit.rows]},
         "claims": [vars(c) for c in claims],
         "units": judge.normalizer.unit,
