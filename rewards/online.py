@@ -241,7 +241,8 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
 
     UserError: a goal, encoder or normalizer that does not fit the cell.
     """
-    simulated = cell.arm == "sim" or bool(cell.task.twin)
+    # a task of one's own is recorded without a simulator's truth, on a twin, too
+    simulated = (cell.arm == "sim" or bool(cell.task.twin)) and not cell.task.own
     keys = {f"{ft.IMAGE_PREFIX}{name}" for name in cell.cameras}
     task = cell.task
     inputs = Inputs.of(

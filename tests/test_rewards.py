@@ -209,7 +209,8 @@ def test_scale_refuses_what_would_mislead() -> None:
     normalizer = fit_scene([good, replace(good)], ["image"])
     with pytest.raises(UserError, match="it has no 'tactile', only image, image .same episode."):
         compute_curves(good, goal_of(good), replace(normalizer, unit={}))
-    curves = compute_curves(good, goal_of(good), replace(normalizer, unit={"image": 0.1}))
+    units = replace(normalizer, unit={"front": 0.1})
+    curves = compute_curves(good, goal_of(good, "image", "touch"), units)
     assert curves.raw.keys() == {"image", "tactile"} and curves.normalised.keys() == {"image"}
     own_camera = replace(good, made_with=EmbeddingSource("towers", camera=""))
     image = goal_of(good, "image")
