@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -94,11 +95,10 @@ def ros_messages() -> list[tuple[str, str, float, dict]]:
 
 
 def ros_object(kind: str, content: dict) -> object:
-    fields = dict(STORE.fielddefs[kind][1])
-    values = {}
-    for name, value in content.items():
-        of = fields[name][1]
-        values[name] = ros_object(of, value) if isinstance(value, dict) else value
+    fields: dict = dict(STORE.fielddefs[kind][1])
+    values: dict[str, Any] = {
+        k: ros_object(fields[k][1], v) if isinstance(v, dict) else v for k, v in content.items()
+    }
     return STORE.types[kind](**values)
 
 
@@ -168,7 +168,9 @@ def test_robomimic(here: Path) -> None:
     assert [episodes.meta(i)["success"] for i in range(3)] == [True, False, True]
     frames = episodes.read(1).frames
     with h5py.File(path) as file:
-        obs = {k: v[:] for k, v in file["data/demo_2/obs"].items()}
+        names = "agentview_image", "robot0_eye_in_hand_image"
+        names += tuple(f"robot0_{n}" for n in ("joint_pos", "joint_vel", "eef_pos", "eef_quat"))
+        obs = {name: np.array(file[f"data/demo_2/obs/{name}"]) for name in names}
     np.testing.assert_array_equal(frames[ft.FRONT], obs["agentview_image"])
     np.testing.assert_array_equal(frames[ft.WRIST], obs["robot0_eye_in_hand_image"])
     state = [obs["robot0_joint_pos"], obs["robot0_joint_vel"], np.full((12, 1), 0.04)]

@@ -29,9 +29,9 @@ from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.by_name import follower
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
+from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.evaluation.evaluate import REFUSED, Trial, run_trials
 from touchgoal.policies.evaluation.success_rate import SuccessRate
-from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.frozen_touch import shipped_touch
@@ -139,8 +139,13 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
         name = f"{' and '.join(inputs) or 'state only'}, {episodes} demos"
         if config.touch_dim and config.touch_input == "embedding":
             name += ", not taught by wrenches"
-        flow = isinstance(config.head, DiffusionConfig) and config.head.sampler.kind == "flow"
-        name += ", regression" * isinstance(config.head, MLPConfig) + ", flow" * flow
+        if isinstance(config.head, MLPConfig):
+            name += ", regression"
+        else:
+            sampler = config.head.sampler
+            name += ", flow" * (sampler.kind == "flow")
+            if (steps := sampler.num_inference_steps) != SamplerConfig().num_inference_steps:
+                name += f", denoised in {steps} step{'s' * (steps > 1)}"
         arms.setdefault(name, []).append(directory)
     return arms
 
