@@ -8,6 +8,7 @@ from typing import IO
 
 import numpy as np
 
+from touchgoal.control.features import COST
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.runtime.errors import UserError
@@ -45,7 +46,10 @@ class EpisodeRecorder:
             key: np.memmap(file, dtype, "r", shape=(self._ticks, *shape))
             for key, (file, dtype, shape) in self._files.items()
         }
-        return EpisodeWriter(self._root, self._fps).append(Episode(frames, task, meta))
+        writer = EpisodeWriter(self._root, self._fps)
+        if writer.metadata and COST not in writer.metadata.features:
+            frames.pop(COST, None)  # a run goes beside demonstrations, which have no cost
+        return writer.append(Episode(frames, task, meta))
 
     def close(self) -> None:
         """Drop what was not saved."""

@@ -223,6 +223,16 @@ def test_a_judge_ends_a_run_and_says_how_it_ended(
     assert f"the judge says: {judge.reading.verdict}" in report(result, metrics(result), "")
 
 
+def test_a_judged_run_goes_beside_demonstrations_that_have_no_cost(tmp_path: Path) -> None:
+    for more in ({}, {ft.COST: np.ones(1, np.float32)}):
+        recorder = EpisodeRecorder(tmp_path / "episodes", ft.CONTROL_HZ)
+        for _ in range(2):
+            recorder.add({ft.STATE: np.zeros(15, np.float32), **more})
+        recorder.save("put it down", {})
+    assert len(episodes := EpisodeSet(tmp_path / "episodes")) == 2
+    assert ft.COST not in episodes.features
+
+
 OWN = """
 import numpy as np
 
