@@ -337,6 +337,22 @@ def test_a_cell_chooses_the_encoder_of_its_rewards(tmp_path: Path) -> None:
         load_cell_cost(read_cell_file(cell))
 
 
+def test_a_task_of_ones_own_is_not_simulated_on_a_twin_either(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As its recordings, to which the judge was fitted, say."""
+    cell, asked = read_cell_file(EXAMPLES / "sim.toml"), []
+    monkeypatch.setattr(Reward, "of_judge", lambda *_: Reward())
+    monkeypatch.setattr(
+        Reward, "prepare", lambda _, inputs: asked.append(inputs.fitted_task) or 1 / 0
+    )
+    for name in ("pick-place", "block on disc"):
+        task = replace(cell.task, name=name, judge="runs/judge", instruction="")
+        with pytest.raises(ZeroDivisionError):
+            load_cell_cost(replace(cell, task=task))
+    assert asked == ["simulated pick-place", "block on disc"]
+
+
 def test_fit_normalizer_wants_successes(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(run_folder)
     for _ in range(2):
