@@ -146,8 +146,9 @@ def _newest(stream: Stream, at: Float[np.ndarray, " t"], name: str) -> Int[np.nd
 
 def _values(stream: Stream, part: Part, rows: Int[np.ndarray, " t"]) -> Shaped[np.ndarray, "t ..."]:
     needed, back = np.unique(rows, return_inverse=True)
-    if stream.is_image:
-        return stream.read(needed)[back]
+    if stream.is_image:  # gigabytes, which are copied only if images are repeated
+        images = stream.read(needed)
+        return images if len(needed) == len(rows) else images[back]
     values = stream.read(np.arange(len(stream.times)) if part.rate else needed).astype(float)
     if part.components is not None:
         try:

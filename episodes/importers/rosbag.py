@@ -142,10 +142,13 @@ def _image(message: Any, topic: str) -> UInt8[np.ndarray, "h w 3"] | None:
 def _read_images(
     path: Path, topic: str, order: np.ndarray, rows: np.ndarray
 ) -> UInt8[np.ndarray, "k h w 3"]:
-    wanted, found = set(order[rows].tolist()), {}
+    wanted = {int(number): row for row, number in enumerate(order[rows])}
+    images = np.empty(0, np.uint8)
     for number, (_, _, _, message) in enumerate(_messages(path, topic)):
-        if number in wanted and (image := _image(message, topic)) is not None:
-            found[number] = image
-        elif number in wanted:
+        if number not in wanted:
+            continue
+        if (image := _image(message, topic)) is None:
             raise UserError(f"{path}: image {number} of {topic} cannot be decoded")
-    return np.stack([found[number] for number in order[rows].tolist()])
+        images = images if images.size else np.empty((len(rows), *image.shape), np.uint8)
+        images[wanted[number]] = image
+    return images
