@@ -85,6 +85,13 @@ def ros_messages() -> list[tuple[str, str, float, dict]]:
         found.append(
             ("/wrench", "geometry_msgs/msg/WrenchStamped", t, {"header": header, "wrench": force})
         )
+        place = {
+            "position": dict(x=t, y=0.0, z=0.5),
+            "orientation": dict(x=0.6, y=0.0, z=0.0, w=0.8),
+        }
+        found.append(
+            ("/tcp", "geometry_msgs/msg/PoseStamped", t, {"header": header, "pose": place})
+        )
     for t, image in zip(TIMES, IMAGES, strict=True):
         for topic, pixels in (("/front/image_raw", image), ("/gelsight/left", 255 - image)):
             data = np.ascontiguousarray(pixels[..., ::-1]).ravel()
@@ -169,14 +176,13 @@ def test_robomimic(here: Path) -> None:
     frames = episodes.read(1).frames
     with h5py.File(path) as file:
         names = "agentview_image", "robot0_eye_in_hand_image"
-        names += tuple(f"robot0_{n}" for n in ("joint_pos", "joint_vel", "eef_pos", "eef_quat"))
+        names += tuple(f"robot0_{n}" for n in ("joint_pos", "joint_vel"))
         obs = {name: np.array(file[f"data/demo_2/obs/{name}"]) for name in names}
     np.testing.assert_array_equal(frames[ft.FRONT], obs["agentview_image"])
     np.testing.assert_array_equal(frames[ft.WRIST], obs["robot0_eye_in_hand_image"])
     state = [obs["robot0_joint_pos"], obs["robot0_joint_vel"], np.full((12, 1), 0.04)]
     np.testing.assert_allclose(frames[ft.STATE], np.concatenate(state, 1), rtol=1e-6)
-    pose = [obs["robot0_eef_pos"], np.roll(obs["robot0_eef_quat"], 1, 1)]  # wxyz of xyzw
-    np.testing.assert_allclose(frames[ft.TCP_POSE], np.concatenate(pose, 1), rtol=1e-6)
+    assert ft.TCP_POSE not in frames  # robosuite's is in the world's frame
     motion = np.diff(obs["robot0_joint_pos"], axis=0, append=obs["robot0_joint_pos"][-1:])
     np.testing.assert_allclose(frames[ft.ACTION][:, :7], motion, atol=1e-5)
 
@@ -192,6 +198,8 @@ def test_ros(here: Path, write: Callable[[Path], Path]) -> None:
     np.testing.assert_allclose(frames[ft.STATE][:, :7], q[:, :7], atol=1e-6)
     np.testing.assert_allclose(frames[ft.STATE][:, -1], 2 * q[:, -1], atol=1e-6)
     np.testing.assert_allclose(frames[ft.WRENCH][:, 2], TIMES, atol=1e-6)
+    np.testing.assert_allclose(frames[ft.TCP_POSE][:, 0], TIMES, atol=1e-6)
+    np.testing.assert_allclose(frames[ft.TCP_POSE][0, 3:], (0.8, 0.6, 0, 0), atol=1e-6)  # wxyz
     assert episodes.meta(0)["sensor"] == "gelsight_mini" and episodes.meta(0)["success"] is True
 
 

@@ -230,11 +230,7 @@ def _width(name: str, stream: Stream) -> Part:
 
 
 def _pose(numbers: Mapping[str, Stream]) -> dict[str, tuple[Part, ...]]:
-    """Return the parts of the tool's pose; quaternions come as xyzw, as ROS and robosuite have them."""
-    place = _named(numbers, r"eef_pos$", (3).__eq__)
-    turn = _named(numbers, r"eef_quat$", (4).__eq__)
-    if place and turn:
-        return {ft.TCP_POSE: (Part(place), Part(turn, (3, 0, 1, 2)))}
+    """Return the parts of the tool's pose, xyzw in ROS; robosuite's is in the world's frame, so it is none."""
     for name, stream in numbers.items():
         if stream.names[3:] and stream.names[3].endswith(".x") and "orientation.w" in stream.names:
             return {ft.TCP_POSE: (Part(name, (*stream.names[:3], *_XYZW)),)}

@@ -25,7 +25,7 @@ def find_episodes(path: Path, fps: float | None) -> list[Callable[[], RawEpisode
     with _open(path) as file:
         env = json.loads(file["data"].attrs.get("env_args", "{}")) if "data" in file else {}
         about = env.get("env_kwargs", {})
-        rate = fps or about.get("control_freq")
+        rate = about.get("control_freq") or fps
         if not rate:
             raise UserError(f"{path} does not tell its rate: add --fps")
         names = [f"data/{name}" for name in file["data"]] if "data" in file else ["/"]
