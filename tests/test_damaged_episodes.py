@@ -33,11 +33,13 @@ from touchgoal.runtime.errors import UserError
 def test_another_format_is_known_by_name(
     name: str, begin: bytes, told: str, tmp_path: Path
 ) -> None:
+    numpy = "NumPy" in told or "pickle" in told
+    way = "convert it to a LeRobotDataset v3" if numpy else "by touchgoal import-demos"
     path = tmp_path / name
     path.write_bytes(begin + bytes(100))
     folder = [] if path.suffix == ".mp4" else [partial(open_source, tmp_path, "front")]
     for reader in (partial(open_source, path, "front"), partial(EpisodeSet, path), *folder):
-        with pytest.raises(UserError, match=f"{name} is {told}.*convert it to a LeRobotDataset v3"):
+        with pytest.raises(UserError, match=f"{name} is {told}.*{way}"):
             reader()
 
 

@@ -39,6 +39,9 @@ _FORMATS = (  # suffixes, first bytes, name
     ((".npy",), b"\x93NUMPY", "a NumPy array"),
     ((".pkl", ".pickle"), b"\x80\x04\x95", "a Python pickle"),
 )
+_IMPORTED = (".hdf5", ".mcap", ".bag", ".db3")
+_IMPORT = "make a set of episodes of it by touchgoal import-demos"
+_CONVERT = "convert it to a LeRobotDataset v3 (docs/data_format.md), or its images to videos or folders of PNG files"
 
 
 @dataclass(frozen=True)
@@ -153,8 +156,7 @@ def refuse_other_format(path: Path) -> None:
     for suffixes, signature, name in _FORMATS:
         if path.suffix.lower() in suffixes or begin.startswith(signature):
             raise UserError(
-                f"{path} is {name}, which is not read here: touchgoal import-demos {path} makes a set "
-                "of HDF5 and ROS bags; save other images as videos or folders of PNG files"
+                f"{path} is {name}, which is not read here: {_IMPORT if suffixes[0] in _IMPORTED else _CONVERT}"
             )
 
 

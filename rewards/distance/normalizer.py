@@ -97,11 +97,11 @@ class DistanceNormalizer:
         """Return why such distances cannot be normalised by this; None if they can.
 
         A plain video counts as taken by the camera that the normalizer was fitted on. The goal of a
-        modality in `same_episode` is a frame of the measured episode itself. With `parts` image and
-        touch need no medians: a hand that lets go ends as it began, and its touch separates nothing.
+        modality in `same_episode` is a frame of the measured episode itself. With `parts` touch needs
+        no medians: where the hand lets go it ends as it began, and separates nothing.
         """
         names = set(modalities) - {"force"}
-        for m in sorted(names - ({"image", "tactile"} if parts and self.unit else set())):
+        for m in sorted(names - ({"tactile"} if parts and self.unit else set())):
             if (name := median_name(m, m in same_episode)) not in self.start:
                 return f"it has no '{name}', only {', '.join(self.start)}"
         reason = self.source.mismatch(source, "image" in names, bool(names & {"tactile", "text"}))
