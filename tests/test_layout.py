@@ -17,9 +17,9 @@ from touchgoal.launch.__main__ import COMMANDS
 
 # Ceilings fall with every change that removes, and rise only by the budget that an issue names,
 # in a change that says so.
-WHEEL_LINES = 51_438  # of Python
-REPOSITORY_LINES = 64_243  # of Python, with benchmarks, plugins and docs
-TEST_LINES = 19_759  # of Python
+WHEEL_LINES = 51_440  # of Python
+REPOSITORY_LINES = 64_245  # of Python, with benchmarks, plugins and docs
+TEST_LINES = 19_761  # of Python
 PAGE_WORDS = 12_000  # README, CHANGELOG and docs/*.md
 COMMANDS_IN_ALL = 34  # sub-commands included
 OPTIONS_IN_ALL = 407  # of all commands, each with its own
