@@ -37,9 +37,8 @@ class SuccessfulEnds:
             if not ends["held"].all(1).any():  # all hands are empty: what they carried was before
                 felt = [embedded.split_features(e.features)[1] for e in episodes]
                 rows = list(map(last_carried, felt, down))
-                ends |= {
-                    v: np.concatenate([r[k] for r in rows]) for k, v in embedded.CARRIED.items()
-                }
+                carried = {k: v for k, v in embedded.CARRIED.items() if k in rows[0]}
+                ends |= {v: np.concatenate([r[k] for r in rows]) for k, v in carried.items()}
         return cls(ends, tuple(e.object for e in episodes), episodes[0].made_with)
 
     def for_trajectory(self, own: embedded.EmbeddedEpisode, what: str) -> embedded.Features:

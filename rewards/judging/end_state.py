@@ -123,7 +123,7 @@ def end_cost(costs: Mapping[str, float]) -> float:
 def _carried_costs(carried: Features, goal: Features, units: Mapping[str, float]) -> Costs:
     """Return the costs against what successes carried, if their hands are empty at the end."""
     held = {name: goal[stored] for name, stored in CARRIED.items() if stored in goal}
-    if "slip" in held:
+    if "slip" in held and "slip" in units:
         slip = float(np.quantile(held["slip"].mean(1), SPREAD_QUANTILE))
         units = {**units, "slip": max(units["slip"], slip)}
     return part_costs(carried, {**goal, **held}, units)
