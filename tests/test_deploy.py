@@ -223,7 +223,7 @@ def test_a_judge_ends_a_run_and_says_how_it_ended(
     assert f"the judge says: {judge.reading.verdict}" in report(result, metrics(result), "")
 
 
-def test_a_judged_run_goes_beside_demonstrations_that_have_no_cost(tmp_path: Path) -> None:
+def test_a_run_with_a_cost_goes_beside_demonstrations_that_have_none(tmp_path: Path) -> None:
     for more in ({}, {ft.COST: np.ones(1, np.float32)}):
         recorder = EpisodeRecorder(tmp_path / "episodes", ft.CONTROL_HZ)
         for _ in range(2):
