@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The policies that the record maze-steps judges: heads that denoise in one step or in four, and a regression, on one
 # set of recordings: those of `make maze-policy` with two rounds of corrections (160 demonstrations, 151 corrected
-# episodes). Some ten minutes of one core.
+# episodes). Some twenty minutes of one core, estimated.
 set -eu
 
 policy() { # name, options

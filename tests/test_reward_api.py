@@ -340,7 +340,7 @@ def test_a_cell_chooses_the_encoder_of_its_rewards(tmp_path: Path) -> None:
 def test_a_task_of_ones_own_is_not_simulated_on_a_twin_either(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As its recordings, to which the judge was fitted, say."""
+    """Its recordings, which a judge is fitted to, hold no simulator's truth."""
     cell, asked = read_cell_file(EXAMPLES / "sim.toml"), []
     monkeypatch.setattr(Reward, "of_judge", lambda *_: Reward())
     monkeypatch.setattr(

@@ -5,7 +5,7 @@ time is the message's own (`header.stamp`), else that of its recording.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -71,9 +71,8 @@ def read_bag(path: Path) -> RawEpisode:
         if name in shapes:
             read = partial(_read_images, path, name, order)
             streams[name] = Stream(at, shapes[name], read)
-        elif (
-            len({v.shape for v in values[name]}) == 1
-        ):  # not of a joint state that changes its joints
+        # a joint state that changes its joints is none
+        elif len({v.shape for v in values[name]}) == 1:
             rows = np.stack(values[name])[order]
             streams[name] = Stream(at, rows.shape[1:], held(rows), names[name])
     if not streams:
@@ -91,11 +90,8 @@ def _messages(path: Path, only: str = "") -> Iterator[tuple[str, str, float, Any
     usual = get_typestore(Stores.ROS2_HUMBLE)  # of bags without definitions, such as older rosbag2
     try:
         with AnyReader([path], default_typestore=usual) as reader:
-            wanted = [
-                c
-                for c in reader.connections
-                if (c.topic == only or not only) and _is_read(c.msgtype)
-            ]
+            links = [c for c in reader.connections if _is_read(c.msgtype)]
+            wanted = [c for c in links if c.topic == only or not only]
             for link, logged, data in reader.messages(wanted) if wanted else ():
                 message = reader.deserialize(data, link.msgtype)
                 stamp = getattr(getattr(message, "header", None), "stamp", None)
@@ -129,14 +125,15 @@ def _numbers(topic: str, kind: str, message: Any) -> dict[str, tuple[np.ndarray,
 def _image(message: Any, topic: str) -> UInt8[np.ndarray, "h w 3"] | None:
     """Return a message's image, RGB; None if it is none of 8 bits."""
     if not hasattr(message, "encoding"):
-        return decode_image(bytes(message.data), topic)
+        is_depth = message.format.startswith(("16UC1", "32FC1"))  # "16UC1; png compressed"
+        return None if is_depth else decode_image(bytes(message.data), topic)
     if message.encoding not in _TO_RGB:
         return None
     rows = np.asarray(message.data).reshape(message.height, message.step)
     channels = {"mono8": 1, "rgb8": 3, "bgr8": 3}.get(message.encoding, 4)
     image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
-    change: Callable = partial(cv2.cvtColor, code=_TO_RGB[message.encoding] or 0)
-    return np.ascontiguousarray(image) if message.encoding == "rgb8" else change(image)
+    code = _TO_RGB[message.encoding]
+    return np.ascontiguousarray(image) if code is None else np.asarray(cv2.cvtColor(image, code))
 
 
 def _read_images(

@@ -14,11 +14,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.sensors.clip import Clip, open_clip
+from touchgoal.control.sensors.clip import VIDEOS, Clip, open_clip
 from touchgoal.episodes.importers.streams import RawEpisode, Stream, held
 from touchgoal.runtime.errors import UserError
 
-_VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
 _TIMES = ("time", "timestamp", "t")
 
 
@@ -58,7 +57,7 @@ def read_video_table(folder: Path) -> RawEpisode:
 
 
 def _videos(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _VIDEOS)
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS)
 
 
 def _frames(clip: Clip, rows: np.ndarray) -> UInt8[np.ndarray, "k h w 3"]:

@@ -82,10 +82,9 @@ class Improvement:
             if done < end:
                 self.record(policy, root, range(done, end))
             episodes, rows = EpisodeSet(root), range(first + end - self.runs, first + end)
-            if not (self.policy(number).parent / _TRAINED).exists():
-                told, found = read_judged(episodes), self.label(episodes)
-                by_judge = [i for i in rows if i not in told or told[i].by == "judge"]
-                write_judged(episodes, {i: found[i] for i in by_judge})
+            if missing := sorted(set(rows) - read_judged(episodes).keys()):
+                found = self.label(episodes)
+                write_judged(episodes, {i: found[i] for i in missing})
             judged, policy = read_judged(episodes), self._trained(number)
             yield Round(number, [judged[i].verdict for i in rows], true_outcomes(episodes, rows))
 
