@@ -121,7 +121,7 @@ class EpisodeWriter:
         for key, video in encoded.videos.items():
             write_file(self._root / set_files.video_path(key, file_number), video)
         write_data_file(path, encoded, current.index_columns_for(description))
-        updated.write(self._root, first_file=len(updated.files) - 1)
+        updated.write(self._root, current.files)
         self.metadata = updated
         return len(self) - 1
 
@@ -215,10 +215,8 @@ class EpisodeSet:
                 for key, value in self._table.slice(i, 1).to_pylist()[0].items()
                 if key in ("length", "tasks")
                 or key.endswith("/crc32")
-                or (
-                    key.startswith((set_files.META_PREFIX, "stats/"))
-                    and not key.startswith(indices)
-                )
+                or (key.startswith("stats/") and not key.startswith(indices))
+                or (key.startswith(set_files.META_PREFIX) and value is not None)
             }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

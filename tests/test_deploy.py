@@ -34,7 +34,7 @@ from touchgoal.control.interfaces import Actor, CostReading, DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.episodes.episode_recorder import EpisodeRecorder
-from touchgoal.episodes.format.repair import validate
+from touchgoal.episodes.format.repair import repair, validate
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.deploy import NOT_DONE, STOPPED
@@ -223,14 +223,22 @@ def test_a_judge_ends_a_run_and_says_how_it_ended(
     assert f"the judge says: {judge.reading.verdict}" in report(result, metrics(result), "")
 
 
-def test_a_run_with_a_cost_goes_beside_demonstrations_that_have_none(tmp_path: Path) -> None:
-    for more in ({}, {ft.COST: np.ones(1, np.float32)}):
-        recorder = EpisodeRecorder(tmp_path / "episodes", ft.CONTROL_HZ)
+def test_a_judged_run_goes_beside_demonstrations(tmp_path: Path) -> None:
+    """It has a cost, and another's word on its outcome; the demonstrations stay what they were."""
+    told, checksums = ({"success": True}, {"judged": "failure"}, {"success": False}), set()
+    for meta in told:
+        recorder = EpisodeRecorder(tmp_path / "set", ft.CONTROL_HZ)
         for _ in range(2):
-            recorder.add({ft.STATE: np.zeros(15, np.float32), **more})
-        recorder.save("put it down", {})
-    assert len(episodes := EpisodeSet(tmp_path / "episodes")) == 2
-    assert ft.COST not in episodes.features
+            cost = {ft.COST: np.ones(1, np.float32)} if "judged" in meta else {}
+            recorder.add({ft.STATE: np.zeros(15, np.float32), **cost})
+        recorder.save("put it down", meta)
+        checksums.add(EpisodeSet(tmp_path / "set").episode_checksum(0))
+    (tmp_path / "set" / "meta" / "stats.json").unlink()
+    repair(tmp_path / "set")
+    episodes = EpisodeSet(tmp_path / "set")
+    assert tuple(episodes.meta(i) for i in range(3)) == told
+    assert ft.COST not in episodes.features and validate(tmp_path / "set") == []
+    assert checksums == {episodes.episode_checksum(0)}
 
 
 OWN = """

@@ -3,12 +3,12 @@
 Columns of meta/episodes beyond LeRobot's, which ignores them: `touchgoal/NAME` for the entry NAME of an
 episode's `meta` (scalar or list of strings), `videos/KEY/crc32` for the checksum of its video. An append
 rewrites the last file of meta/episodes alone, which holds at most `CHUNK` rows: it costs the same in a set of any
-size.
+size, unless its `meta` has a new key.
 """
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,8 @@ class SetMetadata:
     def with_episode(self, description: Description, file_number: int) -> "SetMetadata":
         """Return this metadata with one more episode, whose files have number `file_number`.
 
-        UserError: its frame rate, features or meta keys differ from the set's.
+        Meta that only some episodes have is null in the others. UserError: its frame rate, features or
+        types of meta differ from the set's.
         """
         self._check_same(description)
         tasks = tuple(dict.fromkeys((*self.tasks, description.task)))
@@ -70,13 +71,9 @@ class SetMetadata:
             for key, column in self.index_columns_for(description).items()
         }
         row = self._row(description, file_number, stats)
-        schema = self.files[-1].schema if self.files else _schema(row)
-        if differing := _differing_meta(row, schema):
-            raise UserError(
-                f"the episode's meta differs from the set's in {', '.join(differing)}: give every "
-                "episode of a set the same keys with the same types"
-            )
-        full, begun = self.files[: self._next_file], self.files[self._next_file :]
+        files = [_with_columns(table, _schema(row)) for table in self.files]
+        schema = files[-1].schema if files else _schema(row)
+        full, begun = files[: self._next_file], files[self._next_file :]
         table = pa.concat_tables([*begun, pa.Table.from_pylist([row], schema=schema)])
         if self.stats is not None:
             stats = {key: merge(self.stats[key], stats[key]) for key in stats}
@@ -161,12 +158,14 @@ class SetMetadata:
             row |= {f"stats/{key}/{name}": value for name, value in values.items()}
         return row
 
-    def write(self, root: Path, first_file: int = 0) -> None:
+    def write(self, root: Path, there: Sequence[pa.Table] = ()) -> None:
         """Write meta/, each file atomically; info.json comes last and commits the change.
 
-        Files of meta/episodes before `first_file` are left as they are.
+        `there` are the files of meta/episodes that are in the folder; what did not change is left.
         """
-        for number, table in list(enumerate(self.files))[first_file:]:
+        for number, table in enumerate(self.files):
+            if number < len(there) and there[number] is table:
+                continue
             marked = table.replace_schema_metadata(_OWN)
             write_file(root / set_files.episodes_path(number), _parquet(marked))
         write_file(root / set_files.STATS, _json(self.stats))
@@ -226,14 +225,22 @@ def _dtype_and_shape(feature: dict[str, Any] | None) -> Any:
     return feature and (feature["dtype"], feature["shape"])
 
 
-def _differing_meta(row: Row, schema: pa.Schema) -> list[str]:
-    """Return the meta keys that only one of the two has, or that have another type."""
-    ours = _schema(row)
-    names = {*ours.names, *schema.names}
-    same = {
-        n for n in {*ours.names} & {*schema.names} if ours.field(n).type == schema.field(n).type
-    }
-    return sorted(name.removeprefix(set_files.META_PREFIX) for name in names - same)
+def _with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """Return a table with the columns of a schema that it lacks, null; UserError: a type differs."""
+    other = [
+        n
+        for n in schema.names
+        if n in table.column_names and schema.field(n).type != table.schema.field(n).type
+    ]
+    if other:
+        names = ", ".join(name.removeprefix(set_files.META_PREFIX) for name in other)
+        raise UserError(
+            f"the episode's meta differs from the set's in {names}: give a key the same type in every "
+            "episode of a set"
+        )
+    if set(schema.names) <= set(table.column_names):
+        return table
+    return pa.concat_tables([table, schema.empty_table()], promote_options="default")
 
 
 def _schema(row: Row) -> pa.Schema:
