@@ -2,8 +2,8 @@
 
 A scripted device leads the arm of a twin to put a block on a disc; a policy learns it by sight, runs, and is
 trained on what is accepted as well: by a judge that is fitted on the demonstrations alone, by the twin's
-truth, or all of it. The first round's runs are the same in all. What the folder of an earlier run holds is taken from
-there.
+truth, or all of it. The judge ends the runs, whatever accepts them. The first round's runs are the same in all.
+What the folder of an earlier run holds is taken from there.
 """
 
 import shutil
@@ -76,7 +76,16 @@ class _Lab:
             TemporaryDirectory() as name,
             deployed_twin(scene, True, Path(name), self.number) as cell,
         ):
+            if self.judge.is_dir():
+                table = parse_json(cell.read_bytes())
+                table["task"]["judge"] = str(self.judge.resolve())
+                write_json(cell, table)
             yield cell
+
+    @property
+    def judge(self) -> Path:
+        """Folder of the judge, which ends the runs of all filters; it is fitted on the demonstrations."""
+        return self.out.resolve() / "judge-fit"
 
     def run(self, policy: Path, seeds_: range, out: Path) -> Iterator[bool]:
         """Deploy a policy in scenes, its episodes into `out`; yield the twin's truth of each."""
@@ -112,7 +121,7 @@ class _Lab:
         """Return what goes through rounds with a filter; no round is done yet."""
         folder, train = self.out / name, partial(train_accepted, validation, self.config.train)
         label = {
-            "judge": partial(judge_set, str(self.out / "judge-fit")),
+            "judge": partial(judge_set, str(self.judge)),
             "truth": partial(_truth, folder, len(EpisodeSet(data))),
             "none": _everything,
         }[name]
@@ -130,9 +139,9 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
     with lab.twin() as cell:
         counts = config.demonstrations, max(1, config.demonstrations // 5)
         data, validation = demonstrate(cell, out, counts)
-    if "judge" in config.filters and not (out / "judge-fit" / JUDGE).exists():
-        shutil.rmtree(out / "judge-fit", ignore_errors=True)
-        touchgoal("fit-normalizer", data, "--value", "--judge", "--out", out / "judge-fit")
+    if not (lab.judge / JUDGE).exists():
+        shutil.rmtree(lab.judge, ignore_errors=True)
+        touchgoal("fit-normalizer", data, "--value", "--judge", "--out", lab.judge)
     first = lab.improve("none", data, validation, 0)
     for _ in first.rounds(0):
         pass
