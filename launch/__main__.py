@@ -36,6 +36,7 @@ COMMANDS = {
     "twin": "serve the simulated cell over the wire protocols of real ones",
     "push": "upload an encoder or a policy to the Hugging Face Hub",
     "pull": "download one from the Hugging Face Hub and check it",
+    "report": "pack what a bug report needs of a run into one file",
     "repair": "check a set of episodes and mend what an interruption left",
 }
 

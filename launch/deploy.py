@@ -216,6 +216,7 @@ def _report(result: "Result", out: Path) -> None:
         lost.append(f"metrics.json could not be written ({error.strerror}): make room on the disk")
     say(report(result, numbers, str(out / "episodes")))
     if result.ending.stopped:
+        say(f"for a bug report: touchgoal report {out}")
         line = "; ".join([f"touchgoal deploy: stopped: {result.ending.reason}", *lost])
         print(line, file=sys.stderr)
         sys.exit(STOPPED)
