@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from touchgoal.encoders.training.trackers import Trackers
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 
@@ -43,17 +44,19 @@ class Record:
     """Writer of a run's files."""
 
     def __init__(
-        self, out_dir: Path, identity: Mapping[str, Any], provenance: Mapping[str, Any]
+        self,
+        out_dir: Path,
+        identity: Mapping[str, Any],
+        provenance: Mapping[str, Any],
+        log_with: Sequence[str],
     ) -> None:
-        """Open the folder, made if needed.
+        """Open the folder, made if needed, and the trackers named in `log_with` (see `Trackers`).
 
         `identity`: JSON-able; must be the same when the training resumes.
         """
-        from torch.utils.tensorboard import SummaryWriter  # slow to import
-
         out_dir.mkdir(parents=True, exist_ok=True)
         self._dir, self._head = out_dir, {"identity": _json(identity), "provenance": provenance}
-        self._tensorboard = SummaryWriter(str(out_dir))
+        self._trackers = Trackers(log_with, out_dir, {**_json(identity), **provenance})
 
     def write(self, history: list[dict[str, float]], state: Mapping[str, Any]) -> None:
         """Write the state after an epoch; a kill leaves the old or the new checkpoint, whole."""
@@ -62,14 +65,12 @@ class Record:
             torch.save({**self._head, "history": history, **states}, unfinished)
         lines = "".join(json.dumps(epoch) + "\n" for epoch in history)
         (self._dir / _METRICS).write_text(lines)
-        for name, value in history[-1].items():
-            if name != "epoch" and value is not None:
-                self._tensorboard.add_scalar(name, value, len(history))
-        self._tensorboard.flush()
+        curves = {name: value for name, value in history[-1].items() if name != "epoch"}
+        self._trackers.log(curves, len(history))
 
     def close(self) -> None:
-        """Close TensorBoard's file."""
-        self._tensorboard.close()
+        """End the trackers."""
+        self._trackers.close()
 
 
 def load(

@@ -20,6 +20,9 @@ class TrainerOptions:
     precision: Annotated[Precision, RARE] = "no"
     """Mixed precision: bf16 computes in bfloat16 where that is safe, weights stay float32. For GPUs: a
     CPU without AVX-512 is 20 times slower with it."""
+    log_with: Annotated[tuple[str, ...], RARE] = ("tensorboard",)
+    """Where the curves go: tensorboard (files in --out), wandb, trackio, or another of Accelerate's trackers
+    that is installed."""
     resume: bool = False
     """Continue the run in --out after its last finished epoch."""
 

@@ -121,7 +121,7 @@ def fit(
 ) -> tuple[list[Metrics], dict[str, Any]]:
     """Train; after Ctrl-C the finished epochs can be resumed.
 
-    Writes `metrics.jsonl` (one line per epoch), TensorBoard's event files and `checkpoint.pt` (after
+    Writes `metrics.jsonl` (one line per epoch), curves for the trackers and `checkpoint.pt` (after
     every epoch). Returns the metrics of every epoch, and the provenance to store beside the
     weights. UserError: no such device, or a folder that does not fit `options.resume`.
 
@@ -153,9 +153,9 @@ def fit(
     provenance = {**recipe, "seed": options.seed, "precision": options.precision}
     if options.resume:
         history, provenance = checkpoint.load(out_dir, identity, state, provenance)
-    record = (
-        checkpoint.Record(out_dir, identity, provenance) if accelerator.is_main_process else None
-    )
+    record = None
+    if accelerator.is_main_process:
+        record = checkpoint.Record(out_dir, identity, provenance, options.log_with)
     model, optimizer = accelerator.prepare(training.loss, optimizer)
     try:
         with on_interruption(lambda: _how_to_resume(out_dir, len(history), config.epochs)):
