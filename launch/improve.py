@@ -47,15 +47,17 @@ class Config:
 
 def main(config: Config) -> None:
     """Go through the rounds, print and plot them."""
+    from touchgoal.encoders.training.trackers import Trackers
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.policies.checkpoint import find_policy
     from touchgoal.policies.training import improve
     from touchgoal.rewards.judging.judge import find_judge
     from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.provenance import portable
     from touchgoal.runtime.run_folder import open_run
 
     find_judge(config.judge)  # the options, too, are checked before work
-    read_training(config.validation, config.train, config.data, Path("unused"))
+    _, training = read_training(config.validation, config.train, config.data, Path("unused"))
     policy = find_policy(config.policy) if config.policy else None
     env = improve.simulation_of(EpisodeSet(config.data))
     record = partial(improve.record_simulated, env, config.workers) if env else _ask_for_runs
@@ -63,13 +65,17 @@ def main(config: Config) -> None:
     train = partial(train_accepted, config.validation, config.train)
     out = open_run(config.out, "improve", config, adds=True)
     work = improve.Improvement(out, config.data, config.episodes, record, label, train)
-    rounds = []
+    rounds, trackers = [], Trackers(training.log_with, out, portable(asdict(config)))
     for done in work.rounds(config.rounds, policy):
         rounds.append(done)
         print(f"{improve.HEAD}\n{done}", flush=True)
         figures = {f"{name}_success": [r.successes, *r.interval] for name, r in done.rates.items()}
+        trackers.log(
+            {f"success/{n}": r.successes / r.trials for n, r in done.rates.items()}, done.number
+        )
         write_json(out / "metrics.json", {"rounds": [asdict(r) | figures for r in rounds]})
         improve.plot_rounds(rounds).savefig(out / "success.png")
+    trackers.close()
     last = work.policy(config.rounds)
     print(f"plot: {out / 'success.png'}\npolicy: {last}")
     print(f"next: touchgoal {'run-policy' if env else 'deploy CELL'} --policy {last}")

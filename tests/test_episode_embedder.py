@@ -85,7 +85,11 @@ def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
     with pytest.raises(UserError, match="trained with the towers oil, not paint"):
         EpisodeEmbedder(PaintTowers(), encoder)
     with pytest.raises(UserError, match="starts in contact"):
-        embedder.embed_episode(recorded(contact=2), 20.0, "mine")
+        embedder.embed_episode(recorded(contact=0), 20.0, "mine")
+    early, late = (embedder.embed_episode(recorded(contact=c), 20.0, "mine") for c in (2, 7))
+    assert early.features["touch"][[0, -1]] == pytest.approx(
+        late.features["touch"][[0, -1]], abs=1e-6
+    )
     touch_alone = {k: v for k, v in recorded().frames.items() if k != FRONT}
     touched = embedder.embed_episode(replace(recorded(), frames=touch_alone), 20.0, "mine")
     touched = embedder.describe(touched, recorded().meta)

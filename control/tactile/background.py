@@ -98,9 +98,14 @@ class Background:
 
 
 def untouched_frames(frames: Images) -> UInt8[np.ndarray, "k h w 3"]:
-    """Return the five frames from which a recording's untouched image is taken: see `first_steady`."""
+    """Return the frames from which a recording's untouched image is taken, at least one.
+
+    They are the first five in steady light (`first_steady`), fewer if a touch comes before.
+    """
     first = first_steady(frames)
-    return frames[first : first + _START]
+    found = frames[first : first + _START]
+    strength = [float(local_change(frame, found[0]).max()) for frame in found]
+    return found[: next((i for i, s in enumerate(strength) if s > _SAME_SHAPE), None)]
 
 
 def first_steady(frames: Images, name: str = "") -> int:

@@ -66,8 +66,8 @@ Frames = Mapping[str, np.ndarray]
 class EpisodeEmbedder:
     """Embeds trajectories and goals with frozen encoders.
 
-    The background of each fingertip is the median of the episode's first 5 frames, of which the first 3
-    must be free of contact.
+    The background of each fingertip is the median of the episode's first 5 frames, or of those before the
+    first touch, which must not be in the first one.
     """
 
     def __init__(
@@ -138,11 +138,10 @@ class EpisodeEmbedder:
         following = iter(chunks)
         first = next(following)
         truth = first.frames.get(TRUTH_CONTACT)
-        most = START_FRAMES // 2 + 1  # the median of the first 5 frames is then untouched
-        if self._sides(first.frames) and truth is not None and truth[:most].any():
+        if self._sides(first.frames) and truth is not None and truth[0].any():
             raise UserError(
                 f"{source} starts in contact, so its fingertips have no background; record it "
-                f"with {most} frames before the first touch"
+                f"with {START_FRAMES} frames before the first touch"
             )
         stream = self.stream({**first.frames, **(untouched or {})}, fps, source)
         truths, pieces = [], []
