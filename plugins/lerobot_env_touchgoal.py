@@ -8,6 +8,7 @@ import lerobot_camera_touchgoal  # noqa: F401  registers cameras: lerobot import
 import lerobot_policy_touchgoal  # noqa: F401
 import lerobot_reward_touchgoal  # noqa: F401
 import lerobot_robot_touchgoal  # noqa: F401
+import lerobot_teleoperator_touchgoal  # noqa: F401
 import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig

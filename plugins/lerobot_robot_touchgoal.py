@@ -3,10 +3,11 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from lerobot.robots import Robot, RobotConfig
+from lerobot_teleoperator_touchgoal import MOTION, AskedMotion
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
@@ -20,6 +21,8 @@ from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop
 from touchgoal.control.interfaces import Actor, DriverError
 from touchgoal.control.run_log import RunLog
+from touchgoal.control.teleoperation.config import TeleoperationConfig
+from touchgoal.control.teleoperation.teleoperator import Teleoperator
 from touchgoal.launch.support.cell_run import check_cell, confirm
 from touchgoal.runtime.errors import UserError
 
@@ -35,6 +38,8 @@ class TouchgoalRobotConfig(RobotConfig):
     """Do not ask for the typed confirmation (for tests)."""
     columns: list[str] = field(default_factory=lambda: ["state"])
     """Numbers that lerobot records as one `observation.state`: state, command, tcp_pose, wrench, load, age."""
+    actions: Literal["joints", "hand"] = "joints"
+    """What an action is: the joints' changes, or the hand's motion, as `--teleop.type=touchgoal` gives it."""
 
 
 class TouchgoalRobot(Robot):
@@ -59,7 +64,8 @@ class TouchgoalRobot(Robot):
                 raise UserError(f"this cell has no column {column}: leave it out of columns")
             start = "" if key == ft.STATE else f"{column}."
             self._columns[key] = [start + name for name in features[key].names]
-        self._action = features[ft.ACTION].names
+        self._led = AskedMotion() if config.actions == "hand" else None
+        self._action = MOTION if self._led else features[ft.ACTION].names
         formats = camera_formats(self._cell).items()
         self._images = {key.removeprefix(ft.IMAGE_PREFIX): (*f[1:], 3) for key, f in formats}
         self._connection: CellConnection | None = None
@@ -68,6 +74,7 @@ class TouchgoalRobot(Robot):
         lambda self: dict.fromkeys(sum(self._columns.values(), []), float) | self._images
     )
     action_features = property(lambda self: dict.fromkeys(self._action, float))
+    cameras = property(lambda self: self._images)
     is_connected = property(lambda self: self._connection is not None)
     is_calibrated = True
 
@@ -85,6 +92,9 @@ class TouchgoalRobot(Robot):
             with TemporaryDirectory(dir=".") as nowhere:  # lerobot records by itself
                 safety = check_cell(self._cell, connection, Path(nowhere))
             self._loop = ControlLoop(connection, safety, True, lambda: "", lambda tick: None)
+            if self._led:
+                hand = TeleoperationConfig()
+                self._hand = _Led(self._led, safety, self._loop.commanded, hand)
         except BaseException:
             connection.close()
             raise
@@ -101,13 +111,16 @@ class TouchgoalRobot(Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Run one control tick; return the action as it was done. DriverError: the arm was stopped."""
         log, clock = RunLog(), self._connection.clock
-        wanted = np.array([float(action[name]) for name in self._action])
-        ending = self._loop.run(_OneAction(wanted), np.inf, log)
+        asked = self._led.ask(action) if self._led else action
+        wanted = [float(asked[name]) for name in self._action]
+        actor = self._hand if self._led else _OneAction(np.array(wanted))
+        ending = self._loop.run(actor, np.inf, log)
         if ending.reason != PLAN_ENDED:
             raise DriverError(str(ending))
         if not isinstance(clock, RealClock):  # a lock-step twin's time goes on only so
             clock.wait(clock.now() + 1 / ft.CONTROL_HZ)
-        return dict(zip(self._action, log.newest[ft.ACTION].tolist(), strict=True))
+        done = wanted if self._led else log.newest[ft.ACTION].tolist()
+        return dict(zip(self._action, done, strict=True))
 
     def disconnect(self) -> None:
         """Bring the arm to rest and release the cell."""
@@ -124,3 +137,14 @@ class _OneAction(Actor):
 
     def act(self, observation: ft.Observation) -> np.ndarray:
         return self._action
+
+
+class _Led(Teleoperator):
+    """One tick at a time; the wrench of the first one is that of the free hand."""
+
+    done, _begun = True, False
+
+    def start(self, observation: ft.Observation) -> None:
+        if not self._begun:
+            super().start(observation)
+        self._begun = True

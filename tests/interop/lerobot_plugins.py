@@ -111,7 +111,9 @@ def main() -> None:
         print(run_with_plugins(plugins, python, HERE / "lerobot_camera.py", folder))
         (folder / "twin").mkdir()
         with closing(RunningTwin(TWIN, folder / "twin", 0)) as twin:
-            print(run_with_plugins(plugins, python, HERE / "lerobot_arm.py", twin.cell_file))
+            print(
+                run_with_plugins(plugins, python, HERE / "lerobot_arm.py", twin.cell_file, folder)
+            )
         root = record(folder / "demo", "--env.objects", "wooden_block")
         [own] = touchgoal.Reward.of_judge("gelsight_mini")(root)
         np.save(folder / "own.npy", own.costs["fused"])
