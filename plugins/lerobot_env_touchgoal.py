@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 import lerobot_camera_touchgoal  # noqa: F401  registers cameras: lerobot imports this module alone
+import lerobot_policy_touch  # noqa: F401
 import lerobot_policy_touchgoal  # noqa: F401
 import lerobot_reward_touchgoal  # noqa: F401
 import lerobot_robot_touchgoal  # noqa: F401

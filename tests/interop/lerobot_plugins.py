@@ -52,6 +52,7 @@ def record(out: Path, *options: str) -> Path:
 def train_with_lerobot(python: Path, plugins: Path, folder: Path) -> None:
     """Train the maze's policy on frozen touch by lerobot-train; its first loss must be touchgoal's."""
     root, out = record(folder / "maze", "--task", "bead-maze"), folder / "trained"
+    print(run_with_plugins(plugins, python, HERE / "lerobot_touch.py", root, folder / "touch"))
     run_with_plugins(plugins, python, HERE / "lerobot_policy.py", root, out)
     (rows, theirs), *_ = json.loads((out / "steps.json").read_text())
     episodes, actor = EpisodeSet(root), touchgoal.load_policy("bead-maze")
