@@ -5,9 +5,8 @@ has no order. Ties share a rank. A bump counts only above the noise, eps = 3 sig
 measured before the contact.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,7 +39,6 @@ class CurveMetrics:
     end: float  # d_T (curve)
     net_drop: float  # d_0 - d_T (curve)
     spearman: float | None  # of v and t, average ranks for ties; None for a constant curve
-    kendall_tau_b: float | None  # tau-b of v and t; None for a constant curve
     # local maxima, ends excluded, with prominence >= eps. White noise of standard deviation sigma
     # has about 4 in 100 frames
     peaks: int
@@ -92,7 +90,6 @@ def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> Cu
         end=end,
         net_drop=start - end,
         spearman=spearman(-d, time) if ordered else None,
-        kendall_tau_b=kendall_tau_b(-d, time) if ordered else None,
         peaks=len(find_peaks(d, eps)),
         largest_rebound=largest_rebound(d),
         area=float(np.mean((d[1:] + d[:-1]) / 2)),
@@ -142,13 +139,4 @@ def auc(
 
 def spearman(x: Curve, y: Curve) -> float | None:
     """Return the correlation of ranks, ties sharing their mean; None if either is constant."""
-    return _correlation(stats.spearmanr, x, y)
-
-
-def kendall_tau_b(x: Curve, y: Curve) -> float | None:
-    """Return Kendall's tau-b, corrected for ties in both; None if either is constant."""
-    return _correlation(partial(stats.kendalltau, method="asymptotic"), x, y)
-
-
-def _correlation(of: Callable[[Curve, Curve], Any], x: Curve, y: Curve) -> float | None:
-    return float(np.asarray(of(x, y))[0]) if np.ptp(x) and np.ptp(y) else None
+    return float(np.asarray(stats.spearmanr(x, y))[0]) if np.ptp(x) and np.ptp(y) else None

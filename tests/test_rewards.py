@@ -279,12 +279,10 @@ CURVES = st.lists(st.integers(-6, 6), min_size=3, max_size=24).map(
 STEP = np.where(np.arange(100) < 50, 1.0, 0.0)
 
 
-def test_correlations_by_hand() -> None:
+def test_the_rank_correlation_by_hand() -> None:
     x, y = np.array([1.0, 2.0, 2.0, 3.0]), np.array([1.0, 3.0, 2.0, 4.0])
     # Ranks centred: (-1.5, 0, 0, 1.5) and (-1.5, .5, -.5, 1.5): 4.5 / sqrt(4.5 * 5).
     assert metrics.spearman(x, y) == pytest.approx(0.9**0.5)
-    # 5 concordant pairs, 1 tie in x of 6 pairs: 5 / sqrt(5 * 6).
-    assert metrics.kendall_tau_b(x, y) == pytest.approx(5 / 30**0.5)
 
 
 def test_peaks_by_hand() -> None:
@@ -325,5 +323,5 @@ def test_flat_window_makes_no_peak_of_rounding() -> None:
 @pytest.mark.parametrize("wiggle", [0.0, 1e-7])
 def test_constant_curve_is_undefined_not_perfect(wiggle: float) -> None:
     m = measure_curve(0.7 + wiggle * np.sin(np.arange(60)), contact=None)
-    assert (m.spearman, m.kendall_tau_b, m.t_drop_10, m.t_drop_50) == (None,) * 4
+    assert (m.spearman, m.t_drop_10, m.t_drop_50) == (None,) * 3
     assert m.area == pytest.approx(0.7)

@@ -29,10 +29,6 @@ COLUMNS = {
         "spearman",
         "rank correlation of -cost with time: 1 if it always falls, -1 if it always rises",
     ),
-    "Kendall": (
-        "kendall_tau_b",
-        "tau-b: pairs of frames in falling less those in rising order, as a share of all",
-    ),
 }
 """Header -> field of `CurveMetrics`, and line of the legend."""
 
