@@ -166,8 +166,8 @@ def test_scale_maps_the_usual_start_to_one_and_end_to_zero(tmp_path: Path) -> No
     normalizer.save(tmp_path / "normalizer.json")
     assert DistanceNormalizer.load(tmp_path / "normalizer.json") == normalizer
     assert [p.name for p in tmp_path.iterdir()] == ["normalizer.json"]
-    (tmp_path / "normalizer.json").write_text('{"format": 2}')
-    with pytest.raises(UserError, match="by another version of touchgoal"):
+    (tmp_path / "normalizer.json").write_text('{"start": {}}')
+    with pytest.raises(UserError, match="is no normalizer"):
         DistanceNormalizer.load(tmp_path / "normalizer.json")
 
 

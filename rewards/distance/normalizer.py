@@ -4,9 +4,8 @@ It holds only for the towers, camera, fingertip sensor, touch encoder and scene 
 on. Scaling each episode by its own extremes would make a perfect curve of noise.
 """
 
-import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,6 @@ from touchgoal.runtime.json_file import write_json
 
 NORMALIZER = "normalizer.json"
 """Name of the file in an encoder's folder, fitted on the encoder's training episodes."""
-_FORMAT = 3
 REMEDY = "fit one with touchgoal fit-normalizer, or give --normalizer none for raw distances"
 REAL_SCENE = "recorded, not simulated"
 
@@ -133,27 +131,14 @@ class DistanceNormalizer:
 
     def save(self, path: Path) -> None:
         """Write JSON, atomically."""
-        write_json(path, {"format": _FORMAT, **asdict(self)})
+        write_json(path, self)
 
     @classmethod
     def load(cls, path: Path) -> "DistanceNormalizer":
-        """Read a file that `save` wrote.
-
-        UserError: no such file, not a normalizer, or one of an earlier format.
-        """
-        if not path.is_file():
-            raise UserError(
-                f"there is no normalizer at {path}: make one with touchgoal fit-normalizer"
-            )
+        """Read a file that `save` wrote; UserError: no such file, or another one."""
         try:
-            content = json.loads(path.read_text())
-            if content.pop("format", 1) == _FORMAT:
-                return TypeAdapter(cls).validate_python(content)
-        except (ValueError, RecursionError, AttributeError, TypeError):
+            return TypeAdapter(cls).validate_json(path.read_bytes())
+        except (OSError, ValueError):
             raise UserError(
-                f"{path} is not a normalizer: make one with touchgoal fit-normalizer"
+                f"{path} is no normalizer: make one with touchgoal fit-normalizer"
             ) from None
-        raise UserError(
-            f"{path} was fitted by another version of touchgoal and lacks the units of the parts: "
-            "fit it anew with touchgoal fit-normalizer"
-        )
