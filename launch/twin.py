@@ -40,7 +40,7 @@ class Config:
     arm: Literal["fr3", "ur5e"] = "fr3"
     """FR3 with the Franka Hand, or UR5e with a Robotiq gripper."""
     lock_step: bool = False
-    """Wait for the client that drives the arm, so that runs repeat (for tests)."""
+    """Wait for the client that drives an FR3, so that runs repeat (for tests)."""
     wrench_error: bool = True
     """Give the arm's force estimate noise, bias and drift, as on a real arm."""
     host: str = "127.0.0.1"
@@ -59,10 +59,13 @@ class Config:
 def main(config: Config) -> None:
     """Open the twin, print its addresses, serve until a signal ends it."""
     from touchgoal.control.cell.cell_file import cell_table
+    from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.run_folder import open_run
     from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
+    if config.lock_step and config.arm != "fr3":
+        raise UserError("a UR's clients answer no states to wait for: leave out --lock-step")
     out = open_run(config.out, "twin", config, adds=True).resolve()
     served = config.host, config.port, config.lock_step, out, config.wrench_error
     twin = Twin(TwinConfig(config.env, config.arm, config.seed, *served))

@@ -39,6 +39,8 @@ def check(cell: CellConfig) -> None:
 
 def _check_devices(cell: CellConfig) -> None:
     gripper = cell.gripper
+    if cell.lock_step and cell.arm != "fr3":
+        raise UserError("lock_step is for an FR3's twin: leave it out")
     if cell.arm != "sim":
         if not cell.address:
             raise UserError("address is missing: give the arm's, such as 172.16.0.2")

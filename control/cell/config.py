@@ -249,7 +249,7 @@ class CellConfig:
     safety: SafetySection = field(default_factory=SafetySection)
     """Limits for this cell."""
     lock_step: bool = False
-    """Whether the arm is a twin that waits for its client; the control loop then follows its clock."""
+    """Whether the arm is an FR3's twin that waits for its client; the control loop then follows its clock."""
 
     @property
     def moves_nothing_real(self) -> bool:

@@ -2,15 +2,12 @@
 
 import sys
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from socket import socket
 from typing import Any, Protocol, cast, runtime_checkable
-
-import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.arms import franka, ur
@@ -33,9 +30,6 @@ from touchgoal.runtime.errors import CheckResult, require_all_ok
 # Hz, and s of wall time without an image: slow enough for any loaded machine.
 _LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 0.1, 10.0
 _TWIN_RATE = 25.0  # Hz of a twin's images in its own time, at least
-_CLOCK_TIMEOUT = 1.0  # s of wall time for which an arm's clock may stand still
-_POLL_INTERVAL = 0.002  # s between readings of it
-_HISTORY_LENGTH = 2000  # readings
 
 
 @runtime_checkable
@@ -68,36 +62,6 @@ class RealClock:
     def wait(self, until: float) -> None:
         """See Clock."""
         time.sleep(max(0.0, until - time.monotonic()))
-
-
-class ArmClock:
-    """The arm's own clock, for a UR's twin in lock-step, whose time passes as the machine allows.
-
-    Stamps are wall time; a history maps them to the arm's. When the arm's clock stands still for
-    longer than `_CLOCK_TIMEOUT`, wall time takes over, so that ages show it.
-    """
-
-    def __init__(self, arm: Arm) -> None:
-        self._arm = arm
-        self._clock_history = deque([(time.monotonic(), arm.read().time)], maxlen=_HISTORY_LENGTH)
-
-    def now(self) -> float:
-        """See Clock."""
-        news, wall = self._arm.read().time, time.monotonic()
-        since, last = self._clock_history[-1]
-        if news > last:
-            self._clock_history.append((wall, news))
-            return news
-        return last + max(0.0, wall - since - _CLOCK_TIMEOUT)
-
-    def age(self, stamp: float) -> float:
-        """See Clock."""
-        return self.now() - float(np.interp(stamp, *np.array(self._clock_history).T))
-
-    def wait(self, until: float) -> None:
-        """See Clock."""
-        while self.now() < until:
-            time.sleep(_POLL_INTERVAL)
 
 
 @dataclass(frozen=True)
@@ -176,14 +140,12 @@ def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellC
             print("\n".join(map(str, rows)), flush=True)
             require_all_ok(rows)
         clock: Clock = RealClock()
-        if cell.lock_step and isinstance(gripper, FrankaHand):
+        if cell.lock_step:
             clock = LockStepClock(cell.task.twin, arm, gripper, cameras, load_cell)
             if new_episode:
                 clock.reset(cell.task.seed)
             else:
                 clock.go_on()
-        elif cell.lock_step:
-            clock = ArmClock(arm)
         undo.pop_all()
     truth = partial(ask_twin, cell.task.twin, "truth") if cell.task.twin else None
     return CellConnection(robot, arm, gripper, cameras, load_cell, clock, truth, lease)
@@ -219,8 +181,7 @@ def connect_arm(cell: CellConfig, hz: float, recover: bool = False) -> ArmProces
     ur5e = cell.arm == "ur5e"
     rate, timeout = (ur.RATE, ur.STATE_TIMEOUT) if ur5e else (franka.RATE, franka.STATE_TIMEOUT)
     timeout = cell.safety.state_timeout or timeout
-    lock_step = cell.lock_step and not ur5e
-    config = ArmConfig(cell.address, cell_limits(cell), hz, rate, timeout, lock_step)
+    config = ArmConfig(cell.address, cell_limits(cell), hz, rate, timeout, cell.lock_step)
     return ArmProcess(ur.UrClient if ur5e else franka.FrankaClient, config, recover)
 
 

@@ -156,7 +156,8 @@ class Twin:
             if hand is not None:
                 hand.reset()
 
-        if config.lock_step and hand is not None and isinstance(arm, FrankaArm):
+        if config.lock_step:
+            assert hand is not None and isinstance(arm, FrankaArm)
             self._lock_step = LockStep(cell, arm, hand, images, load_cell)
         self._arm = arm
         self._commands = ControlPort(

@@ -125,10 +125,6 @@ class Robotiq(Service):
             answer = self._serve(frame)
             self.port.write(answer + modbus_crc(answer))
 
-    def hold(self) -> None:
-        """Answer requests while time stands."""
-        self.receive()
-
     def send(self) -> None:
         """Measure the fingers' motion."""
         width = self.cell.env.width()

@@ -41,7 +41,7 @@ class Client:
 
 
 class UrController(Service):
-    """Serves a UR at `host`; without lock-step, because its clients answer no states."""
+    """Serves a UR at `host`."""
 
     def __init__(self, cell: SimulatedCell, host: str) -> None:
         self.cell = cell
