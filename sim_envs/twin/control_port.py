@@ -7,7 +7,7 @@
     hold                            stop a lock-step twin's time until this connection closes
     advance STEPS DRIVEN COMMANDS   advance it by STEPS ms, once a client drives the arm (DRIVEN 1)
                                     and the hand has received COMMANDS commands since `hold`
-    images                        number of images sent on each stream, once all due ones are
+    pictures                        number of images sent on each stream, once all due ones are
     freeze SECONDS                  block arm and hand from their clients, for simulated SECONDS
     drop                            close the arm's connections
     stop-button on|off              user stop of a Franka, emergency stop of a UR
