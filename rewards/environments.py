@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import gymnasium as gym
 
 from touchgoal.runtime.errors import UserError, unknown_name
-from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.for_rl import ForRL
-from touchgoal.sim_envs.fragile_carry import FragileCarry
-from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tasks import ENVIRONMENTS
 
 if TYPE_CHECKING:
@@ -27,13 +25,7 @@ def make(
     task: str, *, reward: "Reward", for_rl: _No = False, **options: Any
 ) -> "RewardWrapper": ...
 @overload
-def make(task: Literal["pick-place"], *, for_rl: _No = False, **options: Any) -> PickPlace: ...
-@overload
-def make(task: Literal["bead-maze"], *, for_rl: _No = False, **options: Any) -> BeadMaze: ...
-@overload
-def make(
-    task: Literal["fragile-carry"], *, for_rl: _No = False, **options: Any
-) -> FragileCarry: ...
+def make(task: str, *, for_rl: _No = False, **options: Any) -> FrankaTactileEnv: ...
 @overload
 def make(task: str, *, for_rl: Literal[True], **options: Any) -> ForRL: ...
 def make(
