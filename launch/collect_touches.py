@@ -92,8 +92,6 @@ def _simulate(config: Any) -> None:
     if recorded:
         print("nothing left to record:", end=" ")
     print(f"{len(episodes)} episodes, {sum(episodes.lengths)} images in {root}")
-    if config.body == "wand":
-        print(_table_row(episodes, "simulation"))
 
 
 def _record_real(config: Any) -> None:
@@ -114,7 +112,6 @@ def _record_real(config: Any) -> None:
     if episodes is None:
         raise UserError("no touch was recorded")
     print(f"{len(episodes)} touches in {root}; the same command with --out {out} continues")
-    print(_table_row(episodes, "human"))
 
 
 def _described(name: str | None, descriptions: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
@@ -129,14 +126,3 @@ def _described(name: str | None, descriptions: tuple[str, ...]) -> tuple[str, tu
         return name, find_wand_object(name).descriptions
     except UserError as error:
         raise UserError(f"--object: {error}; or say with --description how it feels") from error
-
-
-def _table_row(episodes: Any, source: str) -> str:
-    """Return the set's row of MMWand's Table I; `source` is who touched."""
-    objects = {str(episodes.meta(i)["object"]) for i in range(len(episodes))}
-    return (
-        "\nData set (MMWand, Table I)     objects   touches   source      labels   views   language   other\n"
-        "MMWand as published                102     5,182   human       yes      4       yes        vision, touch, force\n"
-        f"this set                    {len(objects):>10}{len(episodes):>10,}   {source:<12}yes      4       yes        "
-        "vision, touch, force"
-    )

@@ -28,8 +28,8 @@ _MIN_NOISE_FRAMES = 10  # before the contact that give sigma; with fewer the who
 class CurveMetrics:
     """Metrics of one curve; None means undefined.
 
-    With v = -d and t the frame number: d_0 is the median of the first 5 frames, d_T the last frame,
-    and net drop = d_0 - d_T. Times of drops are None unless the net drop exceeds eps.
+    With v = -d and t the frame number: d_0 is the median of the first 5 frames, d_T the last frame, and
+    the net drop is d_0 - d_T. Times of drops are None unless the net drop exceeds eps.
     """
 
     frames: int  # n
@@ -37,7 +37,6 @@ class CurveMetrics:
     eps: float  # max(3 sigma, EPS_FLOOR) (curve)
     start: float  # d_0 (curve)
     end: float  # d_T (curve)
-    net_drop: float  # d_0 - d_T (curve)
     spearman: float | None  # of v and t, average ranks for ties; None for a constant curve
     # local maxima, ends excluded, with prominence >= eps. White noise of standard deviation sigma
     # has about 4 in 100 frames
@@ -88,7 +87,6 @@ def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> Cu
         eps=eps,
         start=start,
         end=end,
-        net_drop=start - end,
         spearman=spearman(-d, time) if ordered else None,
         peaks=len(find_peaks(d, eps)),
         largest_rebound=largest_rebound(d),
