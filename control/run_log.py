@@ -63,5 +63,5 @@ def slow_arm(pace: float) -> str:
     """Return advice on an arm whose clock runs at this share of real time."""
     return (
         f"the arm's clock goes at {pace:.2f} of real time: this twin cannot keep up, and "
-        "everything comes late in its time; free the machine, or start it with --lock-step"
+        "everything comes late in its time; free the machine, or start an FR3's with --lock-step"
     )

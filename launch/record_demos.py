@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from touchgoal.control.features import CONTROL_HZ, FRONT
+from touchgoal.control.features import CONTROL_HZ
 from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import DeviceName
 from touchgoal.runtime.errors import UserError
@@ -93,8 +93,6 @@ def main(config: Config) -> None:
         if ending.reason != DISCARDED:
             numbers.append(metrics(result))
         say(report(result, metrics(result), str(out / "episodes")))
-        if result.success:
-            _save_goal_image(result, out / "goal.png")
         if ending.stopped and (not cell.moves_nothing_real or ending.reason == STOPPED_BY_OPERATOR):
             break
         if cell.moves_nothing_real:
@@ -175,11 +173,3 @@ def _open_device(config: Config, connection: "CellConnection", seed: int) -> "Te
         raise UserError("the scripted device needs a simulated scene of pick-place")
     poses = PickPlacePoses(tuple(layout["grasp"]), tuple(layout["goal"]))
     return ScriptedDevice(poses, seed)
-
-
-def _save_goal_image(result: "Result", path: Path) -> None:
-    """Write the front camera's last image, if there is one: a goal for task.rewards."""
-    from PIL import Image
-
-    if FRONT in result.log.newest:
-        Image.fromarray(result.log.newest[FRONT]).save(path)

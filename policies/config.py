@@ -45,16 +45,14 @@ class SamplerConfig:
     loss: Literal["squared", "absolute"] = "squared"
     """Error of the network in training: squared, as published, or absolute, which weighs rare large
     motions less."""
-    # Prediction of the network: the noise (epsilon) or the flow's velocity, as published, or the clean
-    # sample, which needs fewer steps and less training where samples vary little (Ze et al. 2024).
-    prediction_type: Annotated[Literal["epsilon", "velocity", "sample"], FIXED] = "sample"
+    # Prediction of the network: the noise (epsilon), as published, or the clean sample, which needs
+    # fewer steps and less training where samples vary little (Ze et al. 2024), and alone serves flow.
+    prediction_type: Annotated[Literal["epsilon", "sample"], FIXED] = "sample"
     clip: Annotated[Positive, FIXED] = 1.0  # largest magnitude of a clean sample, normalised
 
     def __post_init__(self) -> None:
-        if self.prediction_type == ("epsilon" if self.kind == "flow" else "velocity"):
-            raise UserError(
-                f"a network for {self.kind} cannot predict {self.prediction_type}: try sample"
-            )
+        if self.kind == "flow" and self.prediction_type != "sample":
+            raise UserError("a network for flow predicts samples, not epsilon")
         if self.kind != "flow" and self.num_inference_steps > self.num_train_timesteps:
             raise UserError(
                 f"num_inference_steps {self.num_inference_steps} exceed num_train_timesteps "

@@ -40,8 +40,7 @@ def add_noise(
     if config.kind == "flow":
         time = noise.rand((b,)).to(clean)
         t = _broadcast(time, clean)
-        target = clean - added if config.prediction_type == "velocity" else clean
-        return (1 - t) * added + t * clean, FLOW_TIME_SCALE * time, target
+        return (1 - t) * added + t * clean, FLOW_TIME_SCALE * time, clean
     step = noise.randint(config.num_train_timesteps, (b,))
     power = _broadcast(alphas_cumprod(config.num_train_timesteps)[step].to(clean), clean)
     noisy = power.sqrt() * clean + (1 - power).sqrt() * added
@@ -70,8 +69,7 @@ def _denoise_flow(
 ) -> Tensor:
     n = config.num_inference_steps
     for i in range(n):
-        answer = network(x, x.new_full((len(x),), FLOW_TIME_SCALE * i / n))
-        clean = answer if config.prediction_type == "sample" else x + (1 - i / n) * answer
+        clean = network(x, x.new_full((len(x),), FLOW_TIME_SCALE * i / n))
         x = x + (clean.clamp(-config.clip, config.clip) - x) / (n - i)
     return x
 
