@@ -8,12 +8,14 @@ import termios
 import threading
 import tty
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numbered_images import until
 
-from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
+from touchgoal.control.cell.config import GripperSection
+from touchgoal.control.grippers.robotiq import Robotiq
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.sensors.load_cell import (
     Checksum,
@@ -185,9 +187,10 @@ class Gripper2F85(threading.Thread):
 def test_the_robotiq_opens_closes_and_holds(line: tuple[int, str]) -> None:
     device, port = line
     wire = Gripper2F85(device, active=False, block=150)
+    section = GripperSection("robotiq", port=port)
     with pytest.raises(UserError, match="activate"):
-        Robotiq(RobotiqConfig(port))
-    gripper = Robotiq(RobotiqConfig(port, activate=True))
+        Robotiq(section)
+    gripper = Robotiq(replace(section, activate=True))
     assert gripper.read().width == pytest.approx(0.085)
     gripper.command(0.06)
     until(lambda: abs(gripper.read().width - 0.06) < 4e-4)
@@ -204,7 +207,7 @@ def test_the_robotiq_opens_closes_and_holds(line: tuple[int, str]) -> None:
 def test_the_robotiq_bears_a_garbled_answer_and_says_faults(line: tuple[int, str]) -> None:
     device, port = line
     wire = Gripper2F85(device, active=True)
-    gripper = Robotiq(RobotiqConfig(port))
+    gripper = Robotiq(GripperSection("robotiq", port=port, force=20.0))
     gripper.read()
     wire.garble = 4
     gripper.command(0.0)
@@ -228,7 +231,7 @@ def test_the_robotiqs_port_raises_driver_errors_alone_and_holds_up_no_command(
 ) -> None:
     device, port = line
     Gripper2F85(device, active=True)
-    gripper = Robotiq(RobotiqConfig(port))
+    gripper = Robotiq(GripperSection("robotiq", port=port))
     gripper.read()
     with gripper._port_lock:  # as during an exchange
         gripper.command(0.03)
@@ -246,7 +249,7 @@ def test_the_robotiqs_port_raises_driver_errors_alone_and_holds_up_no_command(
 
 def test_five_answers_missed_in_a_row_lose_the_robotiq(line: tuple[int, str]) -> None:
     wire = Gripper2F85(line[0], active=True)
-    gripper = Robotiq(RobotiqConfig(line[1]))
+    gripper = Robotiq(GripperSection("robotiq", port=line[1]))
     gripper.read()
     wire.garble = 5
     with pytest.raises(DriverError, match="garbled"):

@@ -17,7 +17,7 @@ from touchgoal.control.cell.config import CameraName, CellConfig, FingertipsSect
 from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.cell.twin_client import LockStepClock, ask_twin, lease_twin, reset_scene
 from touchgoal.control.grippers.franka_hand import FrankaHand, NonBlockingGripper
-from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
+from touchgoal.control.grippers.robotiq import Robotiq
 from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell, TactileSensor
 from touchgoal.control.safety.limits import RobotLimits
 from touchgoal.control.sensors.fingertip_source import fingertip_video
@@ -188,7 +188,7 @@ def connect_arm(cell: CellConfig, hz: float, recover: bool = False) -> ArmProces
 def _gripper(cell: CellConfig) -> Gripper:
     own = cell.gripper
     if own.kind == "robotiq":
-        return Robotiq(RobotiqConfig(own.port, own.activate, force=own.force, widths=own.widths))
+        return Robotiq(own)
     hand = FrankaHand(own.address, own.force, cell.lock_step)
     return hand if cell.lock_step else NonBlockingGripper(hand)
 

@@ -4,11 +4,11 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import minimalmodbus
 import numpy as np
 
+from touchgoal.control.cell.config import GripperSection
 from touchgoal.control.interfaces import DriverError, GripperReading
 from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.sensors.latest_value import LatestValue
@@ -26,6 +26,7 @@ POSITIONS = 3, 230  # counts fully open and closed, between which the stroke is 
 SPEEDS = 0.020, ROBOTIQ_2F85.speed  # m/s for 0 to 255
 FORCES = ROBOTIQ_2F85.force  # N for 0 to 255
 
+_SPEED = 0.05  # m/s
 _PERIOD = 0.02  # s between exchanges; one takes 2 to 10 ms
 _ACTIVATION = 8.0  # s that opening and closing once may take
 _MISSES = 5  # unanswered exchanges in a row that mean it is lost
@@ -42,24 +43,10 @@ _FAULTS = {
 }
 
 
-@dataclass(frozen=True)
-class RobotiqConfig:
-    """One gripper."""
-
-    port: str  # such as /dev/ttyUSB0
-    activate: bool = False  # activate it if it is not; it then opens and closes fully once
-    # speed, force: m/s and N
-    speed: float = 0.05
-    force: float = 20.0
-    # m between the fingertips at positions 3 and 230, between which the stroke is linear; measure
-    # your own with sensors mounted
-    widths: tuple[float, float] = (0.085, 0.0)
-
-
 class Robotiq:
     """Gripper over a 2F-85; a thread talks to it, commands never wait for the port."""
 
-    def __init__(self, config: RobotiqConfig) -> None:
+    def __init__(self, config: GripperSection) -> None:
         self.config = config
         self._port = open_port(config.port, 115200, timeout=0.1)
         self._modbus = minimalmodbus.Instrument(self._port, SLAVE)
@@ -159,7 +146,7 @@ class Robotiq:
         wanted = self._wanted
         if wanted is None:
             return
-        speed = to_count(self.config.speed, SPEEDS)
+        speed = to_count(_SPEED, SPEEDS)
         force = to_count(self.config.force, FORCES)
         self._write(bytes([ACTIVATE | GO, 0, 0, wanted, speed, force]))
 
