@@ -12,14 +12,13 @@ from touchgoal.episodes.outcomes.judged import JudgedOutcome, write_judged
 from touchgoal.rewards.judging.judge import Judge, Judgement
 from touchgoal.rewards.report.page import data_uri
 from touchgoal.rewards.report.tables import aligned
-from touchgoal.rewards.report.thumbnails import Thumbnails
+from touchgoal.rewards.report.thumbnails import LONE_HEIGHT, Thumbnails
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 from touchgoal.runtime.atomic_write import atomic_write, write_file
 
 PAGE = "judged.html"
 MOST = 100  # episodes with pictures
 _FILES = Path(__file__).parent / "page_files"
-_HEIGHT = 168  # px
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def _article(end: JudgedEnd) -> str:
 
 
 def _pictures(trajectory: EpisodeTrajectory) -> str:
-    thumbnails = Thumbnails(1, _HEIGHT)
+    thumbnails = Thumbnails(1, LONE_HEIGHT)
     thumbnails.add(trajectory.read([trajectory.length - 1]))
     return "".join(
         f'<figure><img alt="" src="{data_uri(sheet.tobytes())}"><figcaption>{escape(name)}</figcaption></figure>'

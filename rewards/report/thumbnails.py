@@ -13,7 +13,7 @@ from touchgoal.control.features import IMAGE_PREFIX
 from touchgoal.episodes.schema import Episode, is_image
 
 MOST_FRAMES = 32
-_HEIGHT, _LONE_HEIGHT = 96, 168  # px at most, of several cameras and fingertips, and of a lone one
+_HEIGHT, LONE_HEIGHT = 96, 168  # px at most, of several cameras and fingertips, and of a lone one
 COLUMNS = 8  # images in a row of a sheet
 _QUALITY = 70  # of JPEG
 
@@ -45,7 +45,7 @@ class Thumbnails:
     def add(self, planned: Episode) -> None:
         """Add planned frames; only where the trajectory is not read as a whole, all of them at once."""
         keys = list(filter(is_image, planned.frames))
-        height = _LONE_HEIGHT if len(keys) == 1 else self._height
+        height = LONE_HEIGHT if len(keys) == 1 else self._height
         for key in keys:
             small = [_shrunk(image, height) for image in planned.frames[key]]
             self._images.setdefault(key.removeprefix(IMAGE_PREFIX), []).extend(small)
