@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property, lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,11 @@ from jaxtyping import Shaped, UInt8
 
 from touchgoal.episodes.format import episode_table, remote, set_files
 from touchgoal.episodes.format.encoding import EncodedEpisode, encode, read_columns, write_data_file
-from touchgoal.episodes.format.episode_table import EpisodePlace
+from touchgoal.episodes.format.episode_table import EpisodePlace, EpisodePlaces
 from touchgoal.episodes.format.foreign import foreign_file, refusal
 from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.episodes.format.repair import unlisted_files
+from touchgoal.episodes.format.set_files import Row
 from touchgoal.episodes.keys import guess_keys, note_guess, readable_features, stored_names
 from touchgoal.episodes.media import decode_video, video_checksum, video_length
 from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue
@@ -167,11 +169,9 @@ class EpisodeSet:
         self.features: dict[str, dict[str, Any]] = {
             key: features[stored] for key, stored in self._stored.items()
         }
-        self._places = episode_table.locate_episodes(self.root, info, table)
-        files = {name for place in self._places for name in place.files} if complete else ()
-        for name in files:  # before any work with the others
-            if not remote.has_file(self.root, name):
-                raise self._unreadable(name, FileNotFoundError())
+        self._places = EpisodePlaces(self.root, info, table)
+        if complete and (name := remote.first_missing(self.root, self._places.files())):
+            raise self._unreadable(name, FileNotFoundError())
 
     def __len__(self) -> int:
         return len(self._places)
@@ -183,21 +183,21 @@ class EpisodeSet:
         It covers every episode's length, task, meta, statistics and checksums of videos; of a foreign
         set all frames.
         """
-        if self.foreign:
-            content: Any = [self.episode_checksum(i) for i in range(len(self))]
-        else:
-            content = self._table.to_pylist()
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-    @cached_property
-    def _table(self) -> pa.Table:
-        """meta/episodes with statistics."""
-        return episode_table.load_table(self.root).slice(0, len(self))
+        rows: Iterator[Any] = (
+            (self.episode_checksum(i) for i in range(len(self)))
+            if self.foreign
+            else islice(episode_table.read_rows(self.root), len(self))
+        )
+        digest = hashlib.sha256(b"[")
+        for i, row in enumerate(rows):
+            digest.update((", " * (i > 0) + json.dumps(row, sort_keys=True)).encode())
+        digest.update(b"]")
+        return digest.hexdigest()
 
     @property
     def lengths(self) -> list[int]:
         """Number of frames of every episode."""
-        return [place.length for place in self._places]
+        return self._places.lengths
 
     def episode_checksum(self, i: int) -> str:
         """Return the SHA-256 of the content of episode i.
@@ -212,13 +212,21 @@ class EpisodeSet:
             indices = tuple(f"stats/{key}/" for key in INDEX_DTYPES)
             content = {
                 key: value
-                for key, value in self._table.slice(i, 1).to_pylist()[0].items()
+                for key, value in self._listed_row(i).items()
                 if key in ("length", "tasks")
                 or key.endswith("/crc32")
                 or (key.startswith("stats/") and not key.startswith(indices))
                 or (key.startswith(set_files.META_PREFIX) and value is not None)
             }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def _listed_row(self, i: int) -> Row:
+        """Return the row of meta/episodes of an episode of an own set, with statistics."""
+        number = self._places.facts(i, "meta/episodes/")
+        chunk, file = (number[f"meta/episodes/{name}_index"] for name in ("chunk", "file"))
+        name = set_files.episodes_path(chunk * set_files.CHUNK + file)
+        table = _read_listed(self.root, name, (self.root / name).stat().st_mtime_ns)
+        return table.slice(table["episode_index"].index(i).as_py(), 1).to_pylist()[0]
 
     def frame_checksums(self, i: int, key: str) -> frozenset[int]:
         """Return checksums of the frames of a feature of episode i, comparable in this process."""
@@ -229,14 +237,13 @@ class EpisodeSet:
 
     def meta(self, i: int) -> dict[str, MetaValue]:
         """Return the facts about episode i; lerobot records none."""
-        prefix, facts = set_files.META_PREFIX, self._place(i).facts.items()
-        return {
-            k.removeprefix(prefix): v for k, v in facts if k.startswith(prefix) and v is not None
-        }
+        prefix = set_files.META_PREFIX
+        facts = self._places.facts(self._checked(i), prefix)
+        return {k.removeprefix(prefix): v for k, v in facts.items() if v is not None}
 
     def task(self, i: int) -> str:
         """Return the instruction of episode i; "" if none is recorded."""
-        return (self._place(i).facts["tasks"] or [""])[0]
+        return (self._places.facts(self._checked(i), "tasks")["tasks"] or [""])[0]
 
     def stored_numbers(self, i: int, key: str) -> Shaped[np.ndarray, "n d"]:
         """Return a feature of episode i, or `timestamp` (s from its start), as stored.
@@ -286,9 +293,12 @@ class EpisodeSet:
         return f"EpisodeSet({str(self.root)!r}: {len(self)} episodes, {', '.join(self.features)})"
 
     def _place(self, i: int) -> EpisodePlace:
+        return self._places[self._checked(i)]
+
+    def _checked(self, i: int) -> int:
         if not 0 <= i < len(self):
             raise UserError(f"{self.root} has episodes 0 to {len(self) - 1}, not {i}")
-        return self._places[i]
+        return i
 
     def _file(self, name: str) -> Path:
         """Return a file of the set, fetched if the set is remote."""
@@ -369,6 +379,11 @@ class EpisodeSet:
 def _read_column(path: Path, modified: int, name: str) -> pa.ChunkedArray:
     with pq.ParquetFile(path, page_checksum_verification=True) as file:
         return file.read([name])[name]
+
+
+@lru_cache(maxsize=8)
+def _read_listed(root: Path, name: str, modified: int) -> pa.Table:
+    return set_files.read_parquet(root, name)
 
 
 def load_episodes(

@@ -186,9 +186,9 @@ def write_tables(path: Path, tables: Iterable[pa.Table], description: Descriptio
             file.write_table(table, description.rows_per_group)
 
 
-def has_description(file: pq.ParquetFile) -> bool:
-    """Return whether touchgoal wrote a Parquet file."""
-    return _FOOTER_KEY in (file.schema_arrow.metadata or {})
+def has_mark(schema: pa.Schema) -> bool:
+    """Return whether touchgoal wrote the Parquet file of this schema."""
+    return _FOOTER_KEY in (schema.metadata or {})
 
 
 def read_description(file: pq.ParquetFile) -> Description:
@@ -196,7 +196,7 @@ def read_description(file: pq.ParquetFile) -> Description:
 
     UserError: touchgoal did not write the file, or its footer is damaged.
     """
-    if not has_description(file):
+    if not has_mark(file.schema_arrow):
         raise UserError("this Parquet file was not written by touchgoal")
     text, footer = file.schema_arrow.metadata[_FOOTER_KEY], file.schema_arrow.metadata
     try:

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from touchgoal.control.features import FEATURES
 from touchgoal.episodes.format import set_files
-from touchgoal.episodes.format.encoding import has_description
+from touchgoal.episodes.format.encoding import has_mark
 from touchgoal.episodes.format.remote import fetched
 from touchgoal.episodes.schema import INDEX_DTYPES
 from touchgoal.runtime.errors import UserError
@@ -25,7 +25,8 @@ def foreign_file(root: Path, features: dict[str, Any], episodes: pa.Table | None
     `episodes` is None if meta/episodes cannot be read. UserError: the set is touchgoal's own, and a
     file under meta/ is corrupt.
     """
-    listed = sorted((root / "meta/episodes").rglob("*.parquet"))
+    marked = episodes is not None and has_mark(episodes.schema)
+    listed = [] if marked else sorted((root / "meta/episodes").rglob("*.parquet"))
     others = (path for path in listed if path != root / set_files.EPISODES)
     if other := next((path for path in others if _written_by_touchgoal(path) is False), None):
         return other
@@ -36,11 +37,12 @@ def foreign_file(root: Path, features: dict[str, Any], episodes: pa.Table | None
         return None
     cameras = [key for key, feature in features.items() if feature["dtype"] == "video"]
     unchecked = any(f"videos/{key}/crc32" not in episodes.column_names for key in cameras)
-    places = episodes.select(["data/chunk_index", "data/file_index"]).to_pylist()
-    if unchecked or len({set_files.data_path_of(row) for row in places}) < len(places):
+    numbers = ["data/chunk_index", "data/file_index"]
+    distinct = episodes.select(numbers).group_by(numbers).aggregate([]).num_rows
+    if unchecked or distinct < episodes.num_rows:
         error = ValueError("wrong places of files")
         return _foreign_unless_own(root, set_files.EPISODES, error)
-    last = fetched(root, set_files.data_path_of(places[-1]))
+    last = fetched(root, set_files.data_path_of(set_files.last_row(episodes)))
     return last if _written_by_touchgoal(last) is False else None
 
 
@@ -68,7 +70,7 @@ def foreign_data_file(root: Path, if_none: Path | None = None) -> Path | None:
 def _written_by_touchgoal(path: Path) -> bool | None:
     """Return whether a Parquet file has touchgoal's footer; None if it cannot be read."""
     with suppress(OSError, pa.ArrowException), pq.ParquetFile(path) as file:
-        return has_description(file)
+        return has_mark(file.schema_arrow)
     return None
 
 

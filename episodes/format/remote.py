@@ -9,7 +9,7 @@ fsspec+NAME:// opens any other file system of fsspec.
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -60,9 +60,26 @@ def fetched(root: Path, name: str) -> Path:
     return path
 
 
-def has_file(root: Path, name: str) -> bool:
-    """Return whether the set in `root`, or the remote one that it mirrors, has a file."""
-    return (root / name).is_file() or name in _listing(root).get("files", ())
+def first_missing(root: Path, names: Iterable[str]) -> str | None:
+    """Return the first file that neither the set in `root` nor the remote one that it mirrors has.
+
+    Names are quickest sorted by folder: each folder is listed once, not each file looked for.
+    """
+    mirrored, listed, there = _listing(root).get("files", ()), None, set()
+    for name in names:
+        folder, _, file = name.rpartition("/")
+        if folder != listed:
+            listed, there = folder, _files_in(root / folder)
+        if file not in there and name not in mirrored:
+            return name
+    return None
+
+
+def _files_in(folder: Path) -> set[str]:
+    if not folder.is_dir():
+        return set()
+    with os.scandir(folder) as entries:
+        return {entry.name for entry in entries if entry.is_file()}
 
 
 def check_local(root: Path) -> None:
