@@ -22,6 +22,7 @@ from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
+from touchgoal.runtime.parallel.shard import WHOLE, Shard
 from touchgoal.runtime.progress import progress_bar, track
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import Outcome, TaskConfig
@@ -59,16 +60,22 @@ def expert_alone(env: FrankaTactileEnv, spec: EpisodeSpec) -> tuple[Actor, Actor
 
 
 def episode_specs(
-    env: TaskConfig, outcomes: Sequence[Outcome], episodes: int, first_seed: int
+    env: TaskConfig,
+    outcomes: Sequence[Outcome],
+    episodes: int,
+    first_seed: int,
+    shard: Shard = WHOLE,
 ) -> list[EpisodeSpec]:
     """Return specs that take the objects (or wires) in turn, each with every outcome once.
 
-    There are `episodes` of each outcome; seeds count up from the first one.
+    There are `episodes` of each outcome; seeds count up from the first one. A shard has its part of
+    them: all outcomes of every object that it takes.
     """
     options, n = env.reset_options(), len(outcomes)
     return [
         episode_spec(first_seed + i, outcomes[i % n], options[i // n % len(options)])
         for i in range(n * episodes)
+        if shard.holds(i // n)
     ]
 
 

@@ -18,6 +18,7 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
+from touchgoal.runtime.parallel.shard import WHOLE, Shard
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.object_slides import FPS, LOAD, Slide, simulate_object_slide
 
@@ -26,15 +27,22 @@ Recorded = tuple[dict[str, np.ndarray], str, dict[str, Any]]
 """Frames, task and meta of one recording."""
 
 
-def record_slides(root: Path, sensor: str, seed: int, count: int, workers: Workers) -> EpisodeSet:
+def record_slides(
+    root: Path, sensor: str, seed: int, count: int, workers: Workers, shard: Shard = WHOLE
+) -> EpisodeSet:
     """Record slides of pick-and-place's objects, each on another sensor instance; see `record_rig`."""
     low, high = LOAD
     rig = f"{sensor}, objects, {low:g} to {high:g} N, seed {seed}"
-    return record_rig(root, partial(_object_slide, sensor, seed), rig, count, workers)
+    return record_rig(root, partial(_object_slide, sensor, seed), rig, count, workers, shard)
 
 
 def record_rig(
-    root: Path, simulate: Callable[[int], Recorded], rig: str, count: int, workers: Workers
+    root: Path,
+    simulate: Callable[[int], Recorded],
+    rig: str,
+    count: int,
+    workers: Workers,
+    shard: Shard = WHOLE,
 ) -> EpisodeSet:
     """Record the first `count` episodes of a rig; those that the folder holds are not simulated again.
 
@@ -42,16 +50,19 @@ def record_rig(
         simulate: makes a recording from its number, in another process.
         rig: description of the rig and its seed.
         workers: see `parallel_map`.
+        shard: part of the episodes to record; the others go to other folders.
 
     UserError: the folder holds recordings of another rig, or cannot be written to.
     """
     with closing(EpisodeWriter(root, fps=FPS)) as writer:
-        if len(writer) and (other := EpisodeSet(root).meta(0).get(_RIG)) != rig:
+        meta = EpisodeSet(root).meta(0) if len(writer) else {}
+        if meta and (other := meta.get(_RIG)) != rig:
             raise UserError(
                 f"{root} holds recordings of another rig ({other}), not {rig}: give another folder"
             )
-        if len(writer) < count:
-            missing = range(len(writer), count)
+        if meta:
+            shard.require(int(str(meta["stroke"])), root)
+        if missing := [i for i in range(count) if shard.holds(i)][len(writer) :]:
             with parallel_map(partial(_encoded, simulate, rig), missing, workers) as made:
                 for episode in track(made, root.name, "recording", total=len(missing)):
                     writer.append(episode)

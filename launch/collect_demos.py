@@ -45,6 +45,9 @@ class Config:
     """Policy that acts while the expert's actions are recorded (DAgger), named as for run-policy."""
     seed: Seed = 0
     """Random seed of the first episode; each further one adds one."""
+    shard: str = "0/1"
+    """Record part I of N, as I/N counted from 0: 0/4 to 3/4 on four machines, each with its own --out.
+    Together they are the episodes that one run records; --data 'runs/large/*' opens all as one."""
     workers: Count = os.cpu_count() or 1
     """Number of simulating processes."""
     ray: str | None = None
@@ -62,6 +65,7 @@ def main(config: Config) -> None:
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.interruption import on_interruption
     from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.parallel.shard import parse_shard
     from touchgoal.runtime.run_folder import open_run
 
     roles, acts = recording.expert_alone, config.policy not in (None, "expert")
@@ -70,14 +74,16 @@ def main(config: Config) -> None:
             message = "--outcomes needs the planned expert: leave out --feedback and --policy"
             raise UserError(message)
         roles = dagger_roles(config.policy, config.env, config.feedback)
-    specs = recording.episode_specs(config.env, config.outcomes, config.episodes, config.seed)
+    shard = parse_shard(config.shard, config.episodes)
+    whole = config.env, config.outcomes, config.episodes, config.seed
+    specs = recording.episode_specs(*whole, shard)
     out = open_run(config.out, "collect-demos", config, adds=True)
     root = out / "episodes"
     missing = recording.missing_specs(root, specs, corrected=acts)
     if len(missing) < len(specs):
         print(f"{len(specs) - len(missing)} of {len(specs)} seeds are recorded in {root}: skipped")
     if not missing:
-        next_seed = specs[-1].seed + 1
+        next_seed = config.seed + config.episodes * len(config.outcomes)
         print(f"nothing left to record: {len(EpisodeSet(root))} episodes; more: --seed {next_seed}")
         return
     most = None if acts else _MAX_FAILURES

@@ -40,6 +40,8 @@ class Config:
     gelsight_mini_markers for slides."""
     seed: Seed = 0
     """Random seed."""
+    shard: str = "0/1"
+    """Record part I of N, as I/N counted from 0, each part with its own --out; see collect-demos."""
     workers: Count = os.cpu_count() or 1
     """Number of simulating processes."""
     ray: str | None = None
@@ -68,28 +70,30 @@ def _simulate(config: Any) -> None:
     from touchgoal.episodes.format.set_files import INFO
     from touchgoal.episodes.slide_recording import record_slides
     from touchgoal.episodes.store import EpisodeSet
-    from touchgoal.episodes.wand.recording import record_touches
+    from touchgoal.episodes.wand.recording import record_touches, visits
     from touchgoal.runtime.interruption import on_interruption
+    from touchgoal.runtime.parallel.shard import parse_shard
 
+    workers = config.ray or config.workers
+    count = config.episodes or _DEFAULT[config.body][0]
+    shard = parse_shard(config.shard, visits(count) if config.body == "wand" else count)
     if config.object or config.description or config.new_gel:
         raise UserError(
             "--object, --description and --new-gel are for a real wand: give --wand FILE"
         )
-    workers = config.ray or config.workers
-    count = config.episodes or _DEFAULT[config.body][0]
     sensor = config.sensor or _DEFAULT[config.body][1]
     find_sensor(sensor)  # a wrong one is refused before anything is written
     out = open_run(config.out, "collect-touches", config, adds=True)
     root = out / "episodes"
-    recorded = (root / INFO).exists() and len(EpisodeSet(root)) >= count
+    before = len(EpisodeSet(root)) if (root / INFO).exists() else 0
     with on_interruption(
         lambda: f"finished episodes are in {root}; the same command with --out {out} continues"
     ):
         if config.body == "wand":
-            episodes = record_touches(root, sensor, config.seed, count, workers)
+            episodes = record_touches(root, sensor, config.seed, count, workers, shard)
         else:
-            episodes = record_slides(root, sensor, config.seed, count, workers)
-    if recorded:
+            episodes = record_slides(root, sensor, config.seed, count, workers, shard)
+    if len(episodes) == before:
         print("nothing left to record:", end=" ")
     print(f"{len(episodes)} episodes, {sum(episodes.lengths)} images in {root}")
 
@@ -100,9 +104,10 @@ def _record_real(config: Any) -> None:
     from touchgoal.control.cell.wand import WandConfig
     from touchgoal.episodes.wand.real_recording import record_real_touches
 
-    if config.body != "wand" or config.sensor:
+    if config.body != "wand" or config.sensor or config.shard != "0/1":
         raise UserError(
-            "--wand FILE records touches, and the file names the sensor: leave out --body, --sensor"
+            "--wand FILE records touches, and the file names the sensor: leave out --body, --sensor "
+            "and --shard"
         )
     name, descriptions = _described(config.object, config.description)
     wand = read_config(config.wand, WandConfig, "wand file")

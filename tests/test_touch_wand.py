@@ -20,6 +20,7 @@ from touchgoal.encoders.alignment.green_screen import (
 from touchgoal.episodes.wand import recording as wand_recording
 from touchgoal.episodes.wand.recording import record_touches
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.parallel.shard import Shard
 from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.touch_wand import Touch, TouchWand
 from touchgoal.sim_envs.wand.bench import GREEN, VIEWS
@@ -61,7 +62,16 @@ def test_recording_resumes_to_the_same_set(tmp_path: Path, monkeypatch: pytest.M
         record_touches(tmp_path / "part", "gelsight_mini", 5, 1, 1)
         resumed = record_touches(tmp_path / "part", "gelsight_mini", 5, count, 1)
         whole = record_touches(tmp_path / "whole", "gelsight_mini", 5, count, 1)
+        shards = [
+            record_touches(tmp_path / f"{i}", "gelsight_mini", 5, 3, 1, Shard(i, 2)) for i in (0, 1)
+        ]
+        with pytest.raises(UserError, match="another shard's episodes"):
+            record_touches(tmp_path / "0", "gelsight_mini", 5, count, 1, Shard(1, 2))
     assert len(resumed) == len(whole) == count and resumed.checksum == whole.checksum
+    parts = [(part, i) for part in shards for i in range(len(part))]
+    assert [part.episode_checksum(i) for part, i in parts] == [
+        whole.episode_checksum(i) for i in range(3)
+    ]
     assert {str(whole.meta(i)["object"]) for i in range(count)} == {"apple", "clementine"}
     touch = whole.read(0, [*ft.WAND_VIEWS, ft.TACTILE_LEFT, ft.LOAD]).frames
     top = touch[ft.WAND_VIEWS[0]]

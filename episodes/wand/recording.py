@@ -23,6 +23,7 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.episodes.wand.episode import FPS, SET, Visit, wand_episode
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
+from touchgoal.runtime.parallel.shard import WHOLE, Shard
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.touch_wand import Touch, TouchWand, TouchWandConfig
 from touchgoal.sim_envs.wand.objects import wand_objects
@@ -31,27 +32,39 @@ TOUCHES_A_VISIT = 9
 _TRIES = 2000  # random approaches before an object counts as out of reach
 
 
-def record_touches(root: Path, sensor: str, seed: int, count: int, workers: Workers) -> EpisodeSet:
+def visits(count: int) -> int:
+    """Return the number of visits in which `count` touches are recorded."""
+    return -(-count // TOUCHES_A_VISIT)
+
+
+def record_touches(
+    root: Path, sensor: str, seed: int, count: int, workers: Workers, shard: Shard = WHOLE
+) -> EpisodeSet:
     """Record the first `count` touches; those that the folder holds are not simulated again.
 
     UserError: the folder holds another set, or cannot be written to.
 
     Args:
         seed: random seed of the set; touch i is the same for any count.
+        shard: part of the visits to record; the others go to other folders.
     """
+    chosen = [visit for visit in range(visits(count)) if shard.holds(visit)]
+    own = sum(min(TOUCHES_A_VISIT, count - visit * TOUCHES_A_VISIT) for visit in chosen)
     config = f"{sensor}, seed {seed}"
     with closing(EpisodeWriter(root, fps=FPS)) as writer:
         have = len(writer)
-        if have and (other := EpisodeSet(root).meta(0).get(SET)) != config:
+        meta = EpisodeSet(root).meta(0) if have else {}
+        if have and (other := meta.get(SET)) != config:
             raise UserError(
                 f"{root} holds other touches ({other}), not {config}: give another folder"
             )
-        if have < count:
-            visits = range(have // TOUCHES_A_VISIT, -(-count // TOUCHES_A_VISIT))
-            with parallel_map(partial(_visit, sensor, seed), visits, workers) as made:
-                first = have - visits.start * TOUCHES_A_VISIT
-                new = islice(chain.from_iterable(made), first, first + count - have)
-                for episode in track(new, "touches", "touch", count - have):
+        if have:
+            shard.require(int(str(meta["visit"])), root)
+        if have < own:
+            begun, first = divmod(have, TOUCHES_A_VISIT)
+            with parallel_map(partial(_visit, sensor, seed), chosen[begun:], workers) as made:
+                new = islice(chain.from_iterable(made), first, first + own - have)
+                for episode in track(new, "touches", "touch", own - have):
                     writer.append(episode)
                     if wear := episode.description.meta["gel_wear"]:
                         print(f"touch {len(writer) - 1}: the gel looks {wear}: take a new one")
