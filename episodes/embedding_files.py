@@ -17,6 +17,7 @@ def embedding_file(episodes: EpisodeSet, i: int, encoder: str, suffix: str) -> P
         encoder: name that changes with the encoder's weights and preprocessor.
         suffix: ending of the file, such as ".npy".
     """
+    episodes, i = episodes.part(i)
     kept = episodes.root / ".cache" if os.access(episodes.root, os.W_OK) else cache_folder()
     folder = kept / "embeddings" / encoder.replace("/", "_")
     return folder / f"{episodes.episode_checksum(i)[:32]}{suffix}"

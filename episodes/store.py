@@ -32,6 +32,7 @@ from touchgoal.episodes.format.foreign import foreign_file, refusal
 from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.episodes.format.repair import unlisted_files
 from touchgoal.episodes.format.set_files import Row
+from touchgoal.episodes.format.statistics import Stats
 from touchgoal.episodes.keys import guess_keys, note_guess, readable_features, stored_names
 from touchgoal.episodes.media import decode_video, video_checksum, video_length
 from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue
@@ -154,6 +155,8 @@ class EpisodeSet:
         """
         self.root = set_files.set_folder(remote.local_folder(Path(root)))
         info = set_files.load_info(self.root)
+        self.sets: tuple[EpisodeSet, ...] = (self,)
+        """Sets on disk that hold the episodes, in order."""
         self.fps: int = info["fps"]
         table = episode_table.load_table(self.root, leave_out="stats/")
         self.foreign = foreign_file(self.root, info["features"], table) is not None
@@ -175,6 +178,16 @@ class EpisodeSet:
 
     def __len__(self) -> int:
         return len(self._places)
+
+    def part(self, i: int) -> "tuple[EpisodeSet, int]":
+        """Return the set on disk that holds episode i, and its index there."""
+        return self, self._checked(i)
+
+    @cached_property
+    def stats(self) -> dict[str, Stats]:
+        """Recorded statistics over all frames of each feature, as in meta/stats.json."""
+        recorded = set_files.load_json(self.root, set_files.STATS)
+        return {key: recorded[name] for key, name in self._stored.items() if name in recorded}
 
     @cached_property
     def checksum(self) -> str:
@@ -384,14 +397,3 @@ def _read_column(path: Path, modified: int, name: str) -> pa.ChunkedArray:
 @lru_cache(maxsize=8)
 def _read_listed(root: Path, name: str, modified: int) -> pa.Table:
     return set_files.read_parquet(root, name)
-
-
-def load_episodes(
-    path: str | os.PathLike[str], keys: Mapping[str, str] | None = None
-) -> EpisodeSet:
-    """Open a set of episodes that touchgoal or lerobot wrote; see `EpisodeSet`.
-
-    episodes = touchgoal.load_episodes("s3://bucket/set", {"observation.images.top": ft.FRONT})
-    episodes.read(0).frames[ft.FRONT]  # (T, height, width, 3)
-    """
-    return EpisodeSet(path, keys=keys)

@@ -85,7 +85,8 @@ class Config(TrainingOptions):
     PRESETS: ClassVar = {"paper": _PAPER, "sight": _SIGHT}
 
     data: Path
-    """Episode set to train on: successful ones, and those in which an expert corrected a policy."""
+    """Episode set to train on: successful ones, and those in which an expert corrected a policy. A pattern
+    in quotes, such as 'runs/large/*', opens many sets as one."""
     validation: Path
     """Episode set for the validation loss; it must share no recording with --data."""
     preset: Literal["default", "sight", "paper"] = "default"

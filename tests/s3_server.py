@@ -26,7 +26,8 @@ class _Handler(LocalHandler):
         if not (self.server.root / bucket).is_dir():
             self.send(404, _error("NoSuchBucket", "The specified bucket does not exist"))
         elif "list-type=2" in address.query:
-            self._list(bucket, parse_qs(address.query).get("prefix", [""])[0])
+            asked = parse_qs(address.query)
+            self._list(bucket, *(asked.get(name, [""])[0] for name in ("prefix", "delimiter")))
         elif (path := self.server.root / bucket / key).is_file():
             if self.command == "GET":
                 self.server.read.append(key)
@@ -36,10 +37,17 @@ class _Handler(LocalHandler):
 
     do_HEAD = do_GET
 
-    def _list(self, bucket: str, prefix: str) -> None:
+    def _list(self, bucket: str, prefix: str, delimiter: str) -> None:
         folder = self.server.root / bucket
         names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+        inside = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+        folders = {name.partition("/")[0] for name in inside if "/" in name} if delimiter else ()
+        names = [name for name in names if not (delimiter and "/" in name.removeprefix(prefix))]
         rows = "".join(
+            f"<CommonPrefixes><Prefix>{escape(prefix + name)}/</Prefix></CommonPrefixes>"
+            for name in sorted(folders)
+        )
+        rows += "".join(
             f"<Contents><Key>{escape(name)}</Key><LastModified>{_iso(folder / name)}</LastModified>"
             f"<ETag>x</ETag><Size>{(folder / name).stat().st_size}</Size></Contents>"
             for name in names

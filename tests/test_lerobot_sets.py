@@ -210,6 +210,14 @@ def test_a_file_is_fetched_when_first_read(s3: S3Server) -> None:
     assert len(s3.read) == before
 
 
+def test_many_sets_there_are_read_as_one(s3: S3Server) -> None:
+    shutil.copytree(s3.root / "bucket/run", s3.root / "bucket/runs/0")
+    shutil.copytree(s3.root / "bucket/run/episodes", s3.root / "bucket/runs/1")
+    many = touchgoal.load_episodes("s3://bucket/runs/*")
+    assert [many.meta(i)["seed"] for i in range(len(many))] == [0, 1, 2] * 2
+    np.testing.assert_array_equal(many.read(4).frames[ft.STATE], many.read(1).frames[ft.STATE])
+
+
 def test_what_changed_there_is_fetched_again(s3: S3Server) -> None:
     EpisodeSet(ADDRESS).read(0)
     there = s3.root / "bucket/run/episodes"

@@ -14,7 +14,7 @@ from touchgoal.encoders.alignment.heads import PairedEmbeddings
 from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.ssl.frames import check_sensor
 from touchgoal.encoders.towers.towers import Towers
-from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.joined import load_episodes
 from touchgoal.episodes.touches import check_touches, descriptions, draw_frames
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
@@ -52,7 +52,7 @@ def embed_grasps(encoder: AnyTouchEncoder, root: Path, frames: int, seed: int) -
             it needs no cameras.
         frames: number of each episode, both fingertips together.
     """
-    episodes = EpisodeSet(root)
+    episodes = load_episodes(root)
     sides = check_touches(episodes)
     rows, objects = [], []
     for i in track(range(len(episodes)), "embedding grasps", "episode"):

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float32, Int
 from touchgoal.control import features as ft
 from touchgoal.control.arrays import Image, Images
 from touchgoal.encoders.towers.towers import Towers
+from touchgoal.episodes.joined import load_episodes
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import Touches
 from touchgoal.runtime.errors import UserError
@@ -22,9 +23,9 @@ _TEST_SHARE = 1048 / 5182  # MMWand's share of test touches
 def is_wand_set(root: Path, keys: Mapping[str, str] | None = None) -> bool:
     """Whether a folder holds touches of the wand; UserError if it holds no set.
 
-    `keys` as for `EpisodeSet`.
+    See `load_episodes`.
     """
-    episodes = EpisodeSet(root, keys=keys)
+    episodes = load_episodes(root, keys)
     return bool(len(episodes)) and ft.WAND_VIEWS[0] in episodes.features
 
 
@@ -46,7 +47,7 @@ class WandSet:
             raise UserError(
                 f"{root} holds no touches with views: record with collect-touches --body wand"
             )
-        episodes = EpisodeSet(root)
+        episodes = load_episodes(root)
         meta = [episodes.meta(i) for i in range(len(episodes))]
         of: dict[str, list[str]] = {}
         for m in meta:

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.encoders.ssl import frames
-from touchgoal.episodes.format.remote import local_folder
+from touchgoal.episodes.format.remote import is_pattern, local_folder
 from touchgoal.episodes.importers.labelled_videos import has_labels, read_labelled_videos
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
+from touchgoal.episodes.joined import load_episodes
 from touchgoal.episodes.overlap import require_disjoint, require_no_shared_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
@@ -119,9 +120,9 @@ def _require_no_overlap(train: Sequence[_Source], other: Sequence[_Source]) -> N
 
 
 def _open(folder: Path, sensor: str | None, keys: Mapping[str, str] | None) -> _Source:
-    folder = local_folder(folder)
-    if (folder / "meta").exists():
-        episodes = EpisodeSet(folder, keys=keys)
+    folder = folder if is_pattern(folder) else local_folder(folder)
+    if is_pattern(folder) or (folder / "meta").exists():
+        episodes = load_episodes(folder, keys)
         return _Source(folder, frames.find_sensor_name(sensor, episodes), episodes)
     if labelled := has_labels(folder):
         found = read_labelled_videos(folder)

@@ -8,6 +8,7 @@ from typing import Any
 from touchgoal.encoders.training.checkpoint import check_run_folder
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
+from touchgoal.episodes.joined import load_episodes
 from touchgoal.episodes.overlap import require_no_shared_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
@@ -42,7 +43,7 @@ def open_training(config: Any, command: str) -> Path:
 def open_sets(
     data: Path, validation: Path, keys: Mapping[str, str]
 ) -> tuple[EpisodeSet, EpisodeSet]:
-    """Open the training and the validation set; `keys` as for `EpisodeSet`.
+    """Open the training and the validation set, or many as one; see `load_episodes`.
 
     UserError: they are the same, share frames, or are damaged.
     """
@@ -50,7 +51,7 @@ def open_sets(
         raise UserError(
             f"--data and --validation are both {data}: validate on episodes that are not trained on"
         )
-    sets = EpisodeSet(data, keys=keys), EpisodeSet(validation, keys=keys)
+    sets = load_episodes(data, keys), load_episodes(validation, keys)
     require_no_shared_frames(*sets)
     return sets
 

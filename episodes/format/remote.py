@@ -11,7 +11,9 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatchcase as fnmatch
 from functools import cache
+from glob import glob
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -50,6 +52,40 @@ def local_folder(path: Path) -> Path:
             _fetch(url, name, root)
     write_json(root / _LISTING, {"url": url, "files": sorted(files)})
     return root
+
+
+def is_pattern(path: Path) -> bool:
+    """Return whether a path or an address stands for several folders, such as runs/large/*."""
+    return "*" in str(path) and not path.exists()
+
+
+def matching_folders(path: Path) -> list[Path]:
+    """Return the folders, or addresses, that a pattern matches; any other path as it is.
+
+    They are in the order of their names, with numbers as numbers; a run stands for its `episodes/`.
+    UserError: there is none.
+    """
+    if not is_pattern(path):
+        return [path]
+    if url := _address(path):
+        base, _, last = url[: url.index("*")].rpartition("/")
+        found = [base]
+        for part in f"{last}{url[url.index('*') :]}".split("/"):
+            found = [f"{u}/{name}" for u in found for name in _folders_in(u) if fnmatch(name, part)]
+    else:
+        found = [name for name in glob(str(path)) if Path(name).is_dir()]
+    if not found:
+        raise UserError(f"{path} matches no folder: check the pattern, and the quotes around it")
+    found.sort(key=lambda name: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", name)])
+    runs = [Path(name) / "episodes" for name in found]
+    return [r if r.is_dir() else Path(name) for r, name in zip(runs, found, strict=True)]
+
+
+def _folders_in(url: str) -> list[str]:
+    with _one_line_errors(url):
+        filesystem, base = _open(url)
+        found = filesystem.get_file_info(fs.FileSelector(base))
+    return [f.base_name for f in found if f.type == fs.FileType.Directory]
 
 
 def fetched(root: Path, name: str) -> Path:

@@ -66,5 +66,9 @@ def merge(a: Stats, b: Stats) -> Stats:
         "mean": first["mean"] + share * gap,
         "std": np.sqrt(variance + share * (1 - share) * gap**2),
     }
-    merged |= {name: (1 - share) * first[name] + share * second[name] for name in QUANTILES}
+    merged |= {
+        name: (1 - share) * first[name] + share * second[name]
+        for name in QUANTILES
+        if name in a and name in b
+    }
     return {name: value.tolist() for name, value in merged.items()} | {"count": [n_a + n_b]}

@@ -7,6 +7,7 @@ judge ended tells its verdict in meta `judged`, which this file overrides.
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
@@ -31,6 +32,14 @@ class JudgedOutcome:
 
 def read_judged(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
     """Return the judged outcomes of a set by episode; UserError: the file is damaged."""
+    found, first = {}, 0
+    for one in episodes.sets:
+        found |= {first + i: outcome for i, outcome in _read_judged(one).items()}
+        first += len(one)
+    return found
+
+
+def _read_judged(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
     told = {i: episodes.meta(i).get("judged") for i in range(len(episodes))}
     found: dict[int, Any] = {i: JudgedOutcome(v) for i, v in told.items() if v}  # pyright: ignore[reportArgumentType]
     path = episodes.root / JUDGED
@@ -44,6 +53,10 @@ def read_judged(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
 
 def write_judged(episodes: EpisodeSet, outcomes: Mapping[int, JudgedOutcome]) -> None:
     """Write outcomes beside those that the set's file has already, atomically."""
-    path = episodes.root / JUDGED
-    rows = json.loads(path.read_text()) if path.is_file() else {}
-    write_json(path, rows | {str(i): outcome for i, outcome in outcomes.items()})
+    added: dict[Path, dict[str, JudgedOutcome]] = {}
+    for i, outcome in outcomes.items():
+        one, number = episodes.part(i)
+        added.setdefault(one.root / JUDGED, {})[str(number)] = outcome
+    for path, rows in added.items():
+        there = json.loads(path.read_text()) if path.is_file() else {}
+        write_json(path, there | rows)
