@@ -71,6 +71,10 @@ BENCHMARKS = {
     "robustness": ("deployment.robustness", "success under changes that training has not shown"),
     "encoder-speed": ("speed.encoder_speed", "touch embeddings a second"),
     "env-speed": ("speed.env_speed", "steps of the environment a second"),
+    "large-sets": (
+        "speed.large_sets",
+        "opening, joining and going through sets of a million episodes",
+    ),
     "policy-latency": ("speed.policy_latency", "time of a plan, stage by stage"),
     "tactile-speed": ("speed.tactile_speed", "simulated tactile images a second"),
 }
