@@ -10,7 +10,7 @@ from toy_episodes import FPS, make_episode, record
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.embedding_files import embedding_file
-from touchgoal.episodes.joined import load_episodes
+from touchgoal.episodes.format.joined import load_episodes
 from touchgoal.episodes.outcomes.judged import JUDGED, JudgedOutcome, read_judged, write_judged
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.slide_recording import Recorded, record_rig

@@ -21,8 +21,8 @@ from jaxtyping import Int
 from benchmarks.options import BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.episodes.format import set_files
+from touchgoal.episodes.format.joined import load_episodes
 from touchgoal.episodes.format.metadata import SetMetadata
-from touchgoal.episodes.joined import load_episodes
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.option_types import Count, checked_dataclass

@@ -14,7 +14,7 @@ from touchgoal.encoders.alignment.heads import PairedEmbeddings
 from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.ssl.frames import check_sensor
 from touchgoal.encoders.towers.towers import Towers
-from touchgoal.episodes.joined import load_episodes
+from touchgoal.episodes.format.joined import load_episodes
 from touchgoal.episodes.touches import check_touches, descriptions, draw_frames
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Int
 from touchgoal.control import features as ft
 from touchgoal.control.arrays import Image, Images
 from touchgoal.encoders.towers.towers import Towers
-from touchgoal.episodes.joined import load_episodes
+from touchgoal.episodes.format.joined import load_episodes
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import Touches
 from touchgoal.runtime.errors import UserError

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.encoders.ssl import frames
+from touchgoal.episodes.format.joined import load_episodes
 from touchgoal.episodes.format.remote import is_pattern, local_folder
 from touchgoal.episodes.importers.labelled_videos import has_labels, read_labelled_videos
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
-from touchgoal.episodes.joined import load_episodes
 from touchgoal.episodes.overlap import require_disjoint, require_no_shared_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError

@@ -8,7 +8,7 @@ from typing import Any
 from touchgoal.encoders.training.checkpoint import check_run_folder
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
-from touchgoal.episodes.joined import load_episodes
+from touchgoal.episodes.format.joined import load_episodes
 from touchgoal.episodes.overlap import require_no_shared_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError

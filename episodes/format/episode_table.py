@@ -52,7 +52,7 @@ def load_table(root: Path, leave_out: str | None = None) -> pa.Table:
     names = set_files.episodes_files(root)
     tables = [set_files.read_parquet(root, name, leave_out) for name in names]
     try:
-        joined = pa.concat_tables(tables, promote_options="permissive").combine_chunks()
+        joined = pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
         raise set_files.unreadable(root, names[-1], error) from error
     one = all(table.schema.metadata == joined.schema.metadata for table in tables)
@@ -79,7 +79,7 @@ class EpisodePlaces:
         """
         try:
             rows = _in_order(table, info["total_episodes"])
-            self._facts = {name: _whole(rows[name]) for name in rows.column_names}
+            self._facts = {name: rows[name].combine_chunks() for name in rows.column_names}
             self.lengths: list[int] = _numbers(rows, "length").tolist()
             self._first_rows, self._data = _locate_data(rows)
             cameras = [key for key, f in info["features"].items() if f["dtype"] == "video"]
@@ -123,11 +123,10 @@ class EpisodePlaces:
 
     def files(self) -> Iterator[str]:
         """Yield the paths in the set of all files of episodes, each once."""
-        for chunk, file in self._data.numbers():
-            yield set_files.DATA_PATH.format(chunk_index=chunk, file_index=file)
+        for row in self._data.rows():
+            yield set_files.data_path_of(row)
         for key, (_, _, files) in self._videos.items():
-            for chunk, file in files.numbers():
-                yield set_files.VIDEO_PATH.format(video_key=key, chunk_index=chunk, file_index=file)
+            yield from (set_files.video_path_of(row, key) for row in files.rows())
 
 
 class _Files:
@@ -138,14 +137,14 @@ class _Files:
         both, first, of, count = np.unique(
             (chunk << 32) + file, return_index=True, return_inverse=True, return_counts=True
         )
-        self._both = both
+        self._prefix, self._both = prefix, both
         self.first_episode: _Numbers = first[of]  # the first of each episode's file
         self.alone: Bool[np.ndarray, " n"] = count[of] == 1  # whether it is its file's only one
 
-    def numbers(self) -> Iterator[tuple[int, int]]:
-        """Yield chunk and number of every file."""
-        for both in self._both.tolist():
-            yield both >> 32, both & 0xFFFFFFFF
+    def rows(self) -> Iterator[Row]:
+        """Yield the numbers of every file, as in meta/episodes."""
+        chunk, file = f"{self._prefix}/chunk_index", f"{self._prefix}/file_index"
+        return ({chunk: both >> 32, file: both & 0xFFFFFFFF} for both in self._both.tolist())
 
 
 def _locate_data(rows: pa.Table) -> tuple[_Numbers, _Files]:
@@ -179,10 +178,6 @@ def _in_order(table: pa.Table, n: int) -> pa.Table:
         if len(wrong := np.flatnonzero(index[:n] != np.arange(n))):
             raise ValueError(f"it has no episode {wrong[0]}")
     return table.slice(0, n)
-
-
-def _whole(column: pa.ChunkedArray) -> pa.Array:
-    return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
 
 def _numbers(table: pa.Table, name: str, kind: str = "int64") -> np.ndarray:

@@ -101,7 +101,7 @@ class SetMetadata:
         differing = sorted(
             key
             for key in {*ours, *theirs}
-            if _dtype_and_shape(ours.get(key)) != _dtype_and_shape(theirs.get(key))
+            if dtype_and_shape(ours.get(key)) != dtype_and_shape(theirs.get(key))
         )
         if differing:
             raise UserError(
@@ -221,7 +221,8 @@ def _json(value: Any) -> bytes:
     return json.dumps(value, indent=1, allow_nan=False).encode()
 
 
-def _dtype_and_shape(feature: dict[str, Any] | None) -> Any:
+def dtype_and_shape(feature: dict[str, Any] | None) -> Any:
+    """Return what must be equal of a feature in two sets that are to be one; None if absent."""
     return feature and (feature["dtype"], feature["shape"])
 
 

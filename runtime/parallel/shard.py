@@ -9,10 +9,7 @@ from touchgoal.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class Shard:
-    """Part `index` of `count` equal parts, counted from 0: every `count`-th piece, from `index` on.
-
-    A piece stays in its shard when more of them are asked for later.
-    """
+    """Every `count`-th piece from `index` on; each stays there when more are asked for later."""
 
     index: int = 0
     count: int = 1

@@ -11,7 +11,7 @@ from touchgoal.sim_envs.registration import register_environments
 
 if TYPE_CHECKING:
     from touchgoal.encoders.pretrained import load_encoder as load_encoder
-    from touchgoal.episodes.joined import load_episodes as load_episodes
+    from touchgoal.episodes.format.joined import load_episodes as load_episodes
     from touchgoal.policies.checkpoint import load_policy as load_policy
     from touchgoal.policies.evaluation.evaluate import evaluate as evaluate
     from touchgoal.rewards.environments import make as make
@@ -40,7 +40,7 @@ _INTERFACE = {  # one call a job, imported at its first use: `import touchgoal` 
     "evaluate": "touchgoal.policies.evaluation.evaluate",
     "load_encoder": "touchgoal.encoders.pretrained",
     "load_policy": "touchgoal.policies.checkpoint",
-    "load_episodes": "touchgoal.episodes.joined",
+    "load_episodes": "touchgoal.episodes.format.joined",
     "make": "touchgoal.rewards.environments",
     "make_vec": "touchgoal.rewards.environments",
 }

@@ -3,18 +3,29 @@
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
-from functools import cached_property, reduce
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, reduce, wraps
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Shaped
 
 from touchgoal.episodes.format import remote
+from touchgoal.episodes.format.metadata import dtype_and_shape
 from touchgoal.episodes.format.statistics import Stats, merge
-from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
+
+
+def _answered_by_part(method: Callable[..., Any]) -> Any:
+    """Return a method that asks the set that holds episode i."""
+
+    @wraps(method)
+    def ask(self: "JoinedSet", i: int, *arguments: Any, **options: Any) -> Any:
+        one, number = self.part(i)
+        return method(one, number, *arguments, **options)
+
+    return ask
 
 
 class JoinedSet(EpisodeSet):
@@ -58,58 +69,27 @@ class JoinedSet(EpisodeSet):
         one = self.sets[number]
         return one, i - int(self._ends[number]) + len(one)
 
-    def episode_checksum(self, i: int) -> str:
-        """See EpisodeSet."""
-        one, i = self.part(i)
-        return one.episode_checksum(i)
-
-    def frame_checksums(self, i: int, key: str) -> frozenset[int]:
-        """See EpisodeSet."""
-        one, i = self.part(i)
-        return one.frame_checksums(i, key)
-
-    def meta(self, i: int) -> dict[str, MetaValue]:
-        """See EpisodeSet."""
-        one, i = self.part(i)
-        return one.meta(i)
-
-    def task(self, i: int) -> str:
-        """See EpisodeSet."""
-        one, i = self.part(i)
-        return one.task(i)
-
-    def stored_numbers(self, i: int, key: str) -> Shaped[np.ndarray, "n d"]:
-        """See EpisodeSet."""
-        one, i = self.part(i)
-        return one.stored_numbers(i, key)
-
-    def video_length(self, i: int, key: str) -> tuple[int, int, float]:
-        """See EpisodeSet."""
-        one, i = self.part(i)
-        return one.video_length(i, key)
-
-    def read(
-        self, i: int, keys: Sequence[str] | None = None, frames: Sequence[int] | None = None
-    ) -> Episode:
-        """See EpisodeSet."""
-        one, i = self.part(i)
-        return one.read(i, keys, frames)
+    episode_checksum = _answered_by_part(EpisodeSet.episode_checksum)
+    frame_checksums = _answered_by_part(EpisodeSet.frame_checksums)
+    meta = _answered_by_part(EpisodeSet.meta)
+    task = _answered_by_part(EpisodeSet.task)
+    stored_numbers = _answered_by_part(EpisodeSet.stored_numbers)
+    video_length = _answered_by_part(EpisodeSet.video_length)
+    read = _answered_by_part(EpisodeSet.read)
 
 
 def _require_alike(first: EpisodeSet, other: EpisodeSet) -> None:
     """Raise UserError if two sets cannot be read as one."""
-    if first.fps != other.fps:
+    differing = [
+        key
+        for key in sorted({*first.features, *other.features})
+        if dtype_and_shape(first.features.get(key)) != dtype_and_shape(other.features.get(key))
+    ]
+    if first.fps != other.fps or differing:
         raise UserError(
-            f"{first.root} runs at {first.fps} frames per second, {other.root} at {other.fps}: open "
-            "sets of one rate together"
+            f"{first.root} and {other.root} differ in {(differing or ['rate'])[0]}: open sets "
+            "recorded with the same options together"
         )
-    for key in sorted({*first.features, *other.features}):
-        one, two = (each.features.get(key, {}) for each in (first, other))
-        if (one.get("dtype"), one.get("shape")) != (two.get("dtype"), two.get("shape")):
-            raise UserError(
-                f"{first.root} and {other.root} differ in {key}, its presence or shape: open sets "
-                "recorded with the same options together"
-            )
 
 
 def load_episodes(
