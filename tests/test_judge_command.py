@@ -79,9 +79,17 @@ def test_a_hand_that_lets_go_is_judged_by_what_it_carried(embedder: EpisodeEmbed
     for key in (TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT):
         frames[key][36:] = frames[key][0]
     other = {**frames, TACTILE_LEFT: np.roll(frames[TACTILE_LEFT], 60, axis=2)}
-    let_go, holds, wrong = (
+    unfelt = {
+        **frames,
+        TACTILE_LEFT: frames[TACTILE_LEFT].copy(),
+        WRENCH: np.zeros((40, 6), np.float32),
+    }
+    unfelt[TACTILE_LEFT][33:36] = unfelt[TACTILE_LEFT][
+        32
+    ]  # put down so softly that no one feels it
+    let_go, holds, wrong, softly = (
         embedder.embed_episode(replace(kept, frames=f), 20, "one")
-        for f in (frames, kept.frames, other)
+        for f in (frames, kept.frames, other, unfelt)
     )
     ends = SuccessfulEnds.of([let_go, let_go]).features
     assert "carried_touch" in ends and "carried_touch" not in SuccessfulEnds.of([holds]).features
@@ -89,6 +97,8 @@ def test_a_hand_that_lets_go_is_judged_by_what_it_carried(embedder: EpisodeEmbed
     right, off = (end_costs(e.features, 20, ends, units, None) for e in (let_go, wrong))
     assert right["object"] == pytest.approx(0, abs=1e-6) and right["slip"] < 0.35
     assert off["object"] > 0.5 and right["held"] == off["held"] == 0
+    soft = end_costs(softly.features, 20, ends, units, None)
+    assert soft["object"] == pytest.approx(0, abs=1e-6) and soft["slip"] < 0.35
 
 
 def test_fitted_judged_and_corrected(

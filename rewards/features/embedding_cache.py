@@ -15,13 +15,13 @@ from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
 from touchgoal.rewards.features.embedded import TOUCH, EmbeddedEpisode, load_features, save_features
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
-from touchgoal.rewards.judging.end_state import put_down
+from touchgoal.rewards.judging.end_state import carried_row, put_down
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory
 from touchgoal.rewards.sources.trajectory import Trajectory
 from touchgoal.runtime.errors import UserError
 
-_FORMAT = 3  # of the files, and of all code between a frame and its embedding
+_FORMAT = 4  # of the files, and of all code between a frame and its embedding
 
 
 def embed_trajectory(
@@ -46,7 +46,7 @@ def embed_end(embedder: EpisodeEmbedder, trajectory: Trajectory) -> EmbeddedEpis
     """Return what `end_costs` reads of an episode, from a file if there is one.
 
     That is contact and arm at all frames, cameras at the last one, and the touch embedding at two: the
-    last one, and the one before `put_down`, which stands for all frames until then. A video is embedded
+    last one, and the `carried_row`, which stands for all frames until then. A video is embedded
     whole.
     """
     if not isinstance(trajectory, EpisodeTrajectory):
@@ -61,7 +61,7 @@ def embed_end(embedder: EpisodeEmbedder, trajectory: Trajectory) -> EmbeddedEpis
         return _keep(path, embedder.embed_chunks([end], *about))
     contact = embedder.embed_chunks(felt.chunks(), *about, touch=False)
     down, past = put_down(contact.features, trajectory.fps), max(embedder.encoder.offsets)
-    before = last if down is None else max(down - 1, 0)
+    before = carried_row(contact.features, down)
     rows = [*range(min(START_FRAMES, last)), *range(max(before - past, 0), before + 1)]
     again = felt.read([*rows, *range(max(last - past, 0), last + 1)])
     touch = embedder.embed_chunks([again], *about).features[TOUCH][[len(rows) - 1, -1]]

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
 from touchgoal.rewards.features import embedded
-from touchgoal.rewards.judging.end_state import last_carried, put_down
+from touchgoal.rewards.judging.end_state import carried_row, put_down
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
 
@@ -36,9 +36,12 @@ class SuccessfulEnds:
             ends[embedded.PUT_DOWN] = np.array([row is not None for row in down])
             if not ends["held"].all(1).any():  # all hands are empty: what they carried was before
                 felt = [embedded.split_features(e.features)[1] for e in episodes]
-                rows = list(map(last_carried, felt, down))
-                carried = {k: v for k, v in embedded.CARRIED.items() if k in rows[0]}
-                ends |= {v: np.concatenate([r[k] for r in rows]) for k, v in carried.items()}
+                rows = list(map(carried_row, felt, down))
+                carried = {k: v for k, v in embedded.CARRIED.items() if k in felt[0]}
+                ends |= {
+                    v: np.stack([f[k][i] for f, i in zip(felt, rows, strict=True)])
+                    for k, v in carried.items()
+                }
         return cls(ends, tuple(e.object for e in episodes), episodes[0].made_with)
 
     def for_trajectory(self, own: embedded.EmbeddedEpisode, what: str) -> embedded.Features:

@@ -75,10 +75,17 @@ def put_down(history: Features, fps: float) -> int | None:
     return begin + int(np.argmax(changed)) if changed.any() else None
 
 
-def last_carried(history: Features, before: int | None) -> Features:
-    """Return the last row before the put-down, given its row; the last one of all without a put-down."""
-    at = len(next(iter(history.values()), ())) - 1 if before is None else max(before - 1, 0)
-    return take_rows(history, slice(at, at + 1))
+def carried_row(history: Features, before: int | None) -> int:
+    """Return the last row before the put-down, given its row; without one, the last in which something is held.
+
+    Where nothing ever is, it is the last row of all.
+    """
+    if before is not None:
+        return max(before - 1, 0)
+    held = history.get("held", np.zeros((0, 1), bool)).all(axis=1)
+    return (
+        int(np.flatnonzero(held)[-1]) if held.any() else len(next(iter(history.values()), ())) - 1
+    )
 
 
 def end_costs(
@@ -96,7 +103,9 @@ def end_costs(
     seen, felt = split_features(features)
     seen, rest = take_rows(seen, slice(-1, None)), take_rows(felt, slice(-1, None))
     before = put_down(felt, fps)
-    carried = last_carried(felt, before)
+    lets_go = any(stored in goal for stored in CARRIED.values())
+    at = carried_row(felt, before) if before is not None or lets_go else -1
+    carried = take_rows(felt, slice(at, at + 1 or None))
     resting = RESTING if "wrist" in goal else (*cameras_of(goal), *RESTING)
     costs = _some(part_costs({**seen, **rest}, goal, units), resting)
     costs |= _some(_carried_costs(carried, goal, units), _CARRIED)
