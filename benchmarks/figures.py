@@ -124,6 +124,12 @@ def median_rate(metrics: Metrics, start: str, unit: str) -> str:
     return f"{min(rates):,.0f} to {max(rates):,.0f} {unit}"
 
 
+def large_sets(metrics: Metrics) -> str:
+    """Seconds and memory to open a large set, and seconds to open many sets as one."""
+    large, many = metrics["one"][0], metrics["many"][0]
+    return f"{large['seconds']:.0f} s, {large['megabytes'] / 1000:.1f} GB; {many['seconds']:.0f} s"
+
+
 def plan(metrics: Metrics) -> str:
     """Time of a whole plan."""
     stage = next(s for s in metrics["stages"] if s["what"].startswith("a whole plan"))

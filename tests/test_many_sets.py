@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from in_process import in_process_workers
+from in_process import in_process_workers, run_benchmark
 from test_collect_demos import QUICK
 from toy_episodes import FPS, make_episode, record
 
@@ -99,3 +99,10 @@ def test_sets_that_cannot_be_one(tmp_path: Path) -> None:
     EpisodeWriter(tmp_path / "others/0", FPS).append(Episode(frames, "lift"))
     with pytest.raises(UserError, match="differ in observation.images.tactile_left"):
         load_episodes(tmp_path / "*/0")
+
+
+def test_the_benchmark_of_large_sets(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    with in_process_workers():
+        run_benchmark("large-sets", "--episodes", 1005, "--shards", 2, "--out", tmp_path / "out")
+    printed = capsys.readouterr().out
+    assert "one set of 1,005 episodes" in printed and "merge the statistics" in printed
