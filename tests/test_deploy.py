@@ -35,6 +35,7 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.episodes.episode_recorder import EpisodeRecorder
 from touchgoal.episodes.format.repair import repair, validate
+from touchgoal.episodes.schema import MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.deploy import NOT_DONE, STOPPED
@@ -225,7 +226,12 @@ def test_a_judge_ends_a_run_and_says_how_it_ended(
 
 def test_a_judged_run_goes_beside_demonstrations(tmp_path: Path) -> None:
     """It has a cost, and another's word on its outcome; the demonstrations stay what they were."""
-    told, checksums = ({"success": True}, {"judged": "failure"}, {"success": False}), set()
+    told: list[dict[str, MetaValue]] = [
+        {"success": True},
+        {"judged": "failure"},
+        {"success": False},
+    ]
+    checksums = set()
     for meta in told:
         recorder = EpisodeRecorder(tmp_path / "set", ft.CONTROL_HZ)
         for _ in range(2):
@@ -236,7 +242,7 @@ def test_a_judged_run_goes_beside_demonstrations(tmp_path: Path) -> None:
     (tmp_path / "set" / "meta" / "stats.json").unlink()
     repair(tmp_path / "set")
     episodes = EpisodeSet(tmp_path / "set")
-    assert tuple(episodes.meta(i) for i in range(3)) == told
+    assert [episodes.meta(i) for i in range(3)] == told
     assert ft.COST not in episodes.features and validate(tmp_path / "set") == []
     assert checksums == {episodes.episode_checksum(0)}
 

@@ -40,7 +40,11 @@ def test_a_report_holds_the_end_of_the_run_and_no_secret(tmp_path: Path) -> None
     assert [rows[i]["seconds"] for i in (0, -1)] == ["1.500", "11.450"]  # the last 10 s
     assert float(rows[-1]["observation.state.gripper.pos"]) == 229
     sheet = cv2.imdecode(np.frombuffer(files["front.jpg"], np.uint8), cv2.IMREAD_COLOR)
-    assert sheet.shape == (4 * 16, 8 * 16, 3) and abs(float(sheet[-8, -8, 0]) - 229) < 3
+    assert (
+        sheet is not None
+        and sheet.shape == (4 * 16, 8 * 16, 3)
+        and abs(float(sheet[-8, -8, 0]) - 229) < 3
+    )
     assert json.loads(files["episode.json"])["ending"] == "arm: reflex"
     assert files["cell.toml"].decode() == 'front = "rtsp://...@10.0.0.7/front"\ntwin = "...@127.0.0.1:5000"\n'  # fmt: skip
     assert b"torch" in files["doctor.txt"]
