@@ -11,11 +11,13 @@ from typing import Any
 
 import pytest
 import torch
+from accelerate import tracking
 from torch import nn
 
 from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.training import trainer
 from touchgoal.encoders.training.options import TrainerOptions
+from touchgoal.encoders.training.trackers import Trackers
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.launch import train_encoder
 from touchgoal.policies.config import TrainConfig
@@ -54,6 +56,16 @@ def test_tensorboard_lies_beside_the_metrics_and_resuming_is_recorded(tmp_path: 
     history, provenance = fit(line(), tmp_path, go_on, {"command": "go on"})
     assert len(history) == 2 and provenance["command"] == "train"
     assert [resumed["command"] for resumed in provenance["resumed"]] == ["go on"]
+
+
+def test_a_tracker_that_is_not_there_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(UserError, match="did you mean tensorboard"):
+        Trackers(["tensorbord"], tmp_path, {})
+    monkeypatch.setattr(tracking, "get_available_trackers", list)
+    with pytest.raises(UserError, match="pip install wandb"):
+        fit(line(), tmp_path / "run", TrainerOptions(log_with=("wandb",)), {})
 
 
 def test_bfloat16_computes_in_it_and_keeps_float32(tmp_path: Path) -> None:
