@@ -103,7 +103,7 @@ class Reward:
         self._encoder, self._towers, self._plain, self._device = encoder, towers, plain, device
         self._normalizer = normalizer  # one read, or "encoder", "none", or None: by the scene
         self._folder: Path | None = None  # of the given normalizer
-        self._name = "the given normalizer"
+        self._name, self._judges = "the given normalizer", False
         if isinstance(normalizer, str | Path) and str(normalizer) not in ("encoder", "none"):
             self._normalizer = DistanceNormalizer.load(Path(normalizer))
             self._name, self._folder = str(normalizer), Path(normalizer).parent
@@ -118,7 +118,9 @@ class Reward:
         `judge` is its folder, or the name of an encoder that ships with one; UserError: it has none.
         """
         folder = find_judge(judge)
-        return cls(GoalFile(folder / GOAL_FILE), encoder=encoder, normalizer=folder / NORMALIZER)
+        found = cls(GoalFile(folder / GOAL_FILE), encoder=encoder, normalizer=folder / NORMALIZER)
+        found._judges = True  # by the parts alone
+        return found
 
     @overload
     def __call__(
@@ -273,7 +275,8 @@ class Reward:
                 found = DistanceNormalizer.load(path)
         if found is not None:
             own = same_episode(goals)
-            unfit = found.mismatch(embedder.made_with, goals, own, parts=not self._plain)
+            without = () if self._plain else ("image", "tactile") if self._judges else ("tactile",)
+            unfit = found.mismatch(embedder.made_with, goals, own, without)
             if given is None and found.scene != inputs.scene:
                 unfit = (
                     f"it was fitted on {found.scene} episodes and the scene here is {inputs.scene}"

@@ -22,6 +22,7 @@ from touchgoal.control.features import (
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
+from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
@@ -126,6 +127,12 @@ def test_fitted_judged_and_corrected(
     told = json.loads(Path("set/judged.json").read_text())
     assert told["9"]["verdict"] == "failure" and told["9"]["reasons"]
     assert Path("out/judged.html").read_text().count("<img") == 20
+    normalizer = DistanceNormalizer.load(
+        Path("fit/normalizer.json")
+    )  # of images that separate nothing
+    replace(normalizer, start={}, goal={}).save(Path("fit/normalizer.json"))
+    main([*judge, "parts"])
+    assert Path("parts/judged.csv").read_text() == Path("out/judged.csv").read_text()
     with pytest.raises(SystemExit, match="run it in a terminal"):
         main([*judge, "x", "--correct"])
     answers = iter(["f", "", "q"])

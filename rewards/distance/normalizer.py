@@ -4,7 +4,7 @@ It holds only for the towers, camera, fingertip sensor, touch encoder and scene 
 on. Scaling each episode by its own extremes would make a perfect curve of noise.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,16 +90,16 @@ class DistanceNormalizer:
         source: EmbeddingSource,
         modalities: Iterable[str],
         same_episode: frozenset[str],
-        parts: bool = False,
+        without: Collection[str] = (),
     ) -> str | None:
         """Return why such distances cannot be normalised by this; None if they can.
 
         A plain video counts as taken by the camera that the normalizer was fitted on. The goal of a
-        modality in `same_episode` is a frame of the measured episode itself. With `parts` touch needs
-        no medians: where the hand lets go it ends as it began, and separates nothing.
+        modality in `same_episode` is a frame of the measured episode itself. Those in `without` need no
+        medians where parts have units: touch of a hand that lets go ends as it began.
         """
         names = set(modalities) - {"force"}
-        for m in sorted(names - ({"tactile"} if parts and self.unit else set())):
+        for m in sorted(names - set(without if self.unit else ())):
             if (name := median_name(m, m in same_episode)) not in self.start:
                 return f"it has no '{name}', only {', '.join(self.start)}"
         reason = self.source.mismatch(source, "image" in names, bool(names & {"tactile", "text"}))
@@ -117,7 +117,7 @@ class DistanceNormalizer:
         With `parts` a modality without medians is left out. UserError: one that was not fitted, or was
         fitted for something else.
         """
-        reason = self.mismatch(source, raw, same_episode, parts)
+        reason = self.mismatch(source, raw, same_episode, ("image", "tactile") if parts else ())
         if reason:
             raise UserError(f"this normalizer does not apply: {reason}; {REMEDY}")
         normalised = {}
