@@ -103,7 +103,7 @@ def test_franka_holds_clients_to_its_limits(fr3: RunningTwin) -> None:
 
 
 def drives(address: str) -> dict:
-    """Moves, servoes at three rates, and falls silent."""
+    """Servoes at three rates, and falls silent."""
     from rtde_control import RTDEControlInterface
     from rtde_receive import RTDEReceiveInterface
 
@@ -113,25 +113,17 @@ def drives(address: str) -> dict:
         return np.array(receive.getActualQ())
 
     start = at()
-    result: dict[str, Any] = {}
-    control.moveJ((start + 0.2).tolist(), 1.0, 2.0)
-    result["move"] = float(np.abs(at() - start - 0.2).max())
-    control.moveJ(start.tolist(), 1.0, 2.0)
-    result["servo"] = []
+    result: dict[str, Any] = {"servo": []}
     for rate in (20, 125, 500):
         began, worst, taken = time.monotonic(), 0.0, True
         while (now := time.monotonic() - began) < 0.8:
             goal = start.copy()
-            goal[0] += 0.1 * np.sin(2 * now)
+            goal[0] += 0.05 * np.sin(4 * now)  # ends where it begins
             taken &= control.servoJ(goal.tolist(), 0, 0, 1 / rate, 0.1, 300)
             worst = max(worst, abs(at()[0] - goal[0]))
             time.sleep(max(0.0, 1 / rate - (time.monotonic() - began - now)))
         control.servoStop()
         result["servo"].append([taken, worst])
-    control.moveJ(start.tolist(), 1.0, 2.0)
-    pose = receive.getActualTCPPose()
-    control.moveL([*pose[:2], pose[2] - 0.05, *pose[3:]], 0.2, 0.5)
-    result["line"] = (np.array(receive.getActualTCPPose())[:3] - pose[:3]).tolist()
     control.setWatchdog(10)
     for _ in range(10):
         control.kickWatchdog()
@@ -143,12 +135,10 @@ def drives(address: str) -> dict:
 
 
 @pytest.mark.realtime
-def test_ur_moves_servoes_and_watches(ur5e: RunningTwin) -> None:
+def test_ur_servoes_and_watches(ur5e: RunningTwin) -> None:
     result = client(drives, ur5e.cell.address)
-    assert result["move"] < 2e-3
     for taken, worst in result["servo"]:
         assert taken and worst < 0.1  # rad behind a goal at 0.2 rad/s, on a loaded machine
-    np.testing.assert_allclose(result["line"], [0, 0, -0.05], atol=2e-3)
     assert result["kicked"] and not result["silent"]
     assert ur5e.ask("truth")["worst"]["excess"] <= 0
 

@@ -58,7 +58,6 @@ class UrController(Service):
         self.safety, self._mode = Safety.NORMAL, _RUNNING
         self._stopped_at = self._last_input_at = 0.0
         self._clock = 0.0
-        self._speed_fraction = 1.0
         self._nonsense = False
         self._estimate, self._zero, self._wrench = np.zeros(6), np.zeros(6), np.zeros(6)
         self._program = self._new_program()
@@ -77,7 +76,7 @@ class UrController(Service):
         if program.running and self.cell.steps % _CYCLE == 0:
             program.cycle()
         if program.running and program.activity is not None:
-            q, dq = program.activity.step(self.cell.q_d, self.cell.dq_d, self._speed_fraction)
+            q, dq = program.activity.step(self.cell.q_d, self.cell.dq_d)
             hardware = UR5E.hardware
             # Absurd speeds or NaN must not reach the physics either.
             if ((q >= hardware.lower) & (q <= hardware.upper) & (np.abs(dq) < _FASTEST)).all():
@@ -215,8 +214,6 @@ class UrController(Service):
             return
         self._inputs.update(zip(names, values, strict=True))
         self._last_input_at = self._clock
-        if "speed_slider_mask" in names and self._inputs["speed_slider_mask"]:
-            self._speed_fraction = float(np.clip(self._inputs["speed_slider_fraction"], 0.0, 1.0))
         if self._program.running:
             self._program.cycle()
 
@@ -329,14 +326,14 @@ _VARIABLES = {
     "actual_TCP_force": lambda c, p, cell: c._wrench,
     "ft_raw_wrench": lambda c, p, cell: c._wrench,
     "tcp_force_scalar": lambda c, p, cell: float(np.linalg.norm(c._wrench[:3])),
-    "runtime_state": lambda c, p, cell: _PLAYING if p.reported_running else _STOPPED,
+    "runtime_state": lambda c, p, cell: _PLAYING if p.running else _STOPPED,
     "robot_mode": lambda c, p, cell: c._mode,
-    "robot_status_bits": lambda c, p, cell: int(c._mode != _POWER_OFF) | p.reported_running << 1,
+    "robot_status_bits": lambda c, p, cell: int(c._mode != _POWER_OFF) | p.running << 1,
     "safety_mode": lambda c, p, cell: int(c.safety),
     "safety_status": lambda c, p, cell: int(c.safety),
     "safety_status_bits": lambda c, p, cell: c.safety.bits,
-    "speed_scaling": lambda c, p, cell: c._speed_fraction,
-    "target_speed_fraction": lambda c, p, cell: c._speed_fraction,
+    "speed_scaling": lambda c, p, cell: 1.0,
+    "target_speed_fraction": lambda c, p, cell: 1.0,
 }
 
 
