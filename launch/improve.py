@@ -65,7 +65,8 @@ def main(config: Config) -> None:
     train = partial(train_accepted, config.validation, config.train)
     out = open_run(config.out, "improve", config, adds=True)
     work = improve.Improvement(out, config.data, config.episodes, record, label, train)
-    rounds, trackers = [], Trackers(training.log_with, out, portable(asdict(config)))
+    rounds, about = [], portable(asdict(config))
+    trackers = Trackers(training.log_with, out, about, training.device)
     for done in work.rounds(config.rounds, policy):
         rounds.append(done)
         print(f"{improve.HEAD}\n{done}", flush=True)

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from touchgoal.episodes.schema import Episode
 
 _SECONDS = 10.0  # of the newest episode
-_SECRET = re.compile(
-    r"[^\s\"'/]+@(?=[\w\[])"
-)  # of token@host:port, and of user:password@host in an address
+# the part before @ of token@host:port, and of an address with user:password@host
+_SECRET = re.compile(r"[^\s\"'/]+@(?=[\w\[])")
 
 
 @checked_dataclass
@@ -38,12 +37,16 @@ class Config:
 
 def main(config: Config) -> None:
     """Write the file and print what it holds; UserError: no folder of a run."""
+    from touchgoal.control.sensors.clip import in_natural_order
     from touchgoal.runtime.atomic_write import atomic_write
 
-    if not (records := sorted(config.run.glob("config*.json"))):
+    if not (records := in_natural_order(config.run.glob("config*.json"))):
         raise UserError(f"{config.run} is no folder of a run: it has no config.json")
     path, names = config.run / "report.zip", []
-    with atomic_write(path) as unfinished, zipfile.ZipFile(unfinished, "w", 8) as archive:
+    with (
+        atomic_write(path) as unfinished,
+        zipfile.ZipFile(unfinished, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
         for name, content in _contents(config.run, records):
             archive.writestr(name, content)
             names.append(name)

@@ -16,10 +16,11 @@ from touchgoal.control.arms.driver_process import DriverProcess
 from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, shift_wrench
 from touchgoal.control.cell import connection
 from touchgoal.control.cell.cell_file import EXAMPLES, read_cell_file
+from touchgoal.control.cell.config import GripperSection
 from touchgoal.control.grippers import robotiq
 from touchgoal.control.grippers.franka_hand import FrankaHandClient
 from touchgoal.control.grippers.hand_commands import HandCommands
-from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
+from touchgoal.control.grippers.robotiq import Robotiq
 from touchgoal.control.interfaces import ArmReading, DriverError, Frame
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.safety.limits import FR3, UR5E
@@ -283,7 +284,8 @@ def test_when_and_how_a_hand_is_commanded() -> None:
 @sides((7.9, 8.2))
 def test_a_robotiq_has_eight_seconds_to_activate(wall: Wall, value: float, beyond: bool) -> None:
     gripper = Robotiq.__new__(Robotiq)
-    gripper.config, gripper._write = RobotiqConfig("", activate=True), lambda command: None
+    gripper.config = GripperSection("robotiq", activate=True)
+    gripper._write = lambda command: None
     gripper._status = lambda: bytes([0x31 if wall.now > value else 0x11])
     assert ("does not become active" in complaint(gripper._start)) == beyond
 

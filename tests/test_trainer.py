@@ -62,7 +62,7 @@ def test_a_tracker_that_is_not_there_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(UserError, match="did you mean tensorboard"):
-        Trackers(["tensorbord"], tmp_path, {})
+        Trackers(["tensorbord"], tmp_path, {}, "cpu")
     monkeypatch.setattr(tracking, "get_available_trackers", list)
     with pytest.raises(UserError, match="pip install wandb"):
         fit(line(), tmp_path / "run", TrainerOptions(log_with=("wandb",)), {})

@@ -94,10 +94,8 @@ class _Lab:
                 scene = Scene("pick-place", seed, OBJECT)
                 what = cell, scene, str(policy), "lock-step", self.config.seconds, out, TASK
                 run = deploy(*what)
-                if run.ending.startswith(
-                    REFUSED
-                ):  # nothing moved; on a loaded machine a device may be late
-                    run = deploy(*what)
+                # nothing has moved: on a loaded machine a device may be late
+                run = deploy(*what) if run.ending.startswith(REFUSED) else run
                 if run.ending.startswith(REFUSED):
                     raise UserError(run.ending)
                 yield bool(ask_twin(read_cell_file(cell).task.twin, "truth")["success"])

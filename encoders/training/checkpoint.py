@@ -49,6 +49,7 @@ class Record:
         identity: Mapping[str, Any],
         provenance: Mapping[str, Any],
         log_with: Sequence[str],
+        device: str,
     ) -> None:
         """Open the folder, made if needed, and the trackers named in `log_with` (see `Trackers`).
 
@@ -56,7 +57,7 @@ class Record:
         """
         out_dir.mkdir(parents=True, exist_ok=True)
         self._dir, self._head = out_dir, {"identity": _json(identity), "provenance": provenance}
-        self._trackers = Trackers(log_with, out_dir, {**_json(identity), **provenance})
+        self._trackers = Trackers(log_with, out_dir, {**_json(identity), **provenance}, device)
 
     def write(self, history: list[dict[str, float]], state: Mapping[str, Any]) -> None:
         """Write the state after an epoch; a kill leaves the old or the new checkpoint, whole."""

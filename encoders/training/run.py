@@ -7,6 +7,7 @@ from typing import Any
 
 from touchgoal.encoders.training.checkpoint import check_run_folder
 from touchgoal.encoders.training.options import TrainerOptions
+from touchgoal.encoders.training.trackers import check_trackers
 from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.format.joined import load_episodes
 from touchgoal.episodes.overlap import require_no_shared_frames
@@ -17,8 +18,9 @@ from touchgoal.runtime.run_folder import open_run
 
 
 def check_run(options: TrainerOptions, out: Path | None) -> None:
-    """Check device and folder; UserError: no such device, an unfit folder, none where one is needed."""
+    """Check device, trackers and folder; UserError: no such one, an unfit folder, none where one is needed."""
     check_device(options.device)
+    check_trackers(options.log_with)
     if out is None and options.resume:
         raise UserError("to resume a run, name its folder with --out")
     if out is None and int(os.environ.get("WORLD_SIZE", 1)) > 1:
