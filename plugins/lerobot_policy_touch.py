@@ -22,7 +22,7 @@ from lerobot.processor import PolicyProcessorPipeline, ProcessorStepRegistry
 from lerobot.processor.factory import make_default_pre_post_processors
 from lerobot.processor.pipeline import ObservationProcessorStep
 from lerobot.utils.constants import OBS_ENV_STATE
-from lerobot_policy_touchgoal import as_recorded
+from lerobot_policy_touchgoal import DATA_MISSING, as_recorded
 from torch import Tensor
 
 from touchgoal.control.features import TACTILE
@@ -109,9 +109,7 @@ class TouchStep(ObservationProcessorStep):
     def _start(self, episode: int) -> dict[str, np.ndarray]:
         if episode not in self._untouched:
             if not self.data:
-                raise ValueError(
-                    "--policy.data=FOLDER names the set that lerobot loads, to train on it"
-                )
+                raise ValueError(DATA_MISSING)
             frames = EpisodeSet(Path(self.data)).read(episode, TACTILE, [0]).frames
             self._untouched[episode] = {key: images[0] for key, images in frames.items()}
         return self._untouched[episode]

@@ -37,6 +37,9 @@ from touchgoal.policies.training.train import (
     untrained,
 )
 
+DATA_MISSING = "--policy.data=FOLDER names the set that lerobot loads, to train on it"
+"""Message where it is not named."""
+
 
 @PreTrainedConfig.register_subclass("touchgoal")
 @dataclass
@@ -89,9 +92,7 @@ class TouchgoalPolicy(PreTrainedPolicy):
     def _windows(self) -> SequenceDataset:
         """All windows of the set to train on; their rows are lerobot's `index`."""
         if not self.config.data:
-            raise ValueError(
-                "--policy.data=FOLDER names the set that lerobot loads, to train on it"
-            )
+            raise ValueError(DATA_MISSING)
         episodes, actor = EpisodeSet(Path(self.config.data)), self._saved()
         recorded = load_recordings(episodes, range(len(episodes)), actor.config, actor.touch)
         return SequenceDataset(recorded, actor.config)

@@ -155,8 +155,7 @@ def fit(
         history, provenance = checkpoint.load(out_dir, identity, state, provenance)
     record = None
     if accelerator.is_main_process:
-        more = options.log_with, options.device
-        record = checkpoint.Record(out_dir, identity, provenance, *more)
+        record = checkpoint.Record(out_dir, identity, provenance, options.log_with, options.device)
     model, optimizer = accelerator.prepare(training.loss, optimizer)
     try:
         with on_interruption(lambda: _how_to_resume(out_dir, len(history), config.epochs)):

@@ -11,7 +11,7 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from fnmatch import fnmatchcase as fnmatch
+from fnmatch import fnmatchcase
 from functools import cache
 from glob import glob
 from pathlib import Path
@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 
 from pyarrow import fs
 
+from touchgoal.control.sensors.clip import in_natural_order
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.json_file import parse_json, write_json
 
@@ -71,14 +72,15 @@ def matching_folders(path: Path) -> list[Path]:
         base, _, last = url[: url.index("*")].rpartition("/")
         found = [base]
         for part in f"{last}{url[url.index('*') :]}".split("/"):
-            found = [f"{u}/{name}" for u in found for name in _folders_in(u) if fnmatch(name, part)]
+            found = [
+                f"{u}/{name}" for u in found for name in _folders_in(u) if fnmatchcase(name, part)
+            ]
     else:
         found = [name for name in glob(str(path)) if Path(name).is_dir()]
     if not found:
         raise UserError(f"{path} matches no folder: check the pattern, and the quotes around it")
-    found.sort(key=lambda name: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", name)])
-    runs = [Path(name) / "episodes" for name in found]
-    return [r if r.is_dir() else Path(name) for r, name in zip(runs, found, strict=True)]
+    folders = in_natural_order(map(Path, found))
+    return [run if (run := folder / "episodes").is_dir() else folder for folder in folders]
 
 
 def _folders_in(url: str) -> list[str]:

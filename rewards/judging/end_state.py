@@ -82,10 +82,8 @@ def carried_row(history: Features, before: int | None) -> int:
     """
     if before is not None:
         return max(before - 1, 0)
-    held = history.get("held", np.zeros((0, 1), bool)).all(axis=1)
-    return (
-        int(np.flatnonzero(held)[-1]) if held.any() else len(next(iter(history.values()), ())) - 1
-    )
+    held = np.flatnonzero(history.get("held", np.zeros((0, 1), bool)).all(axis=1))
+    return int(held[-1]) if len(held) else len(next(iter(history.values()), ())) - 1
 
 
 def end_costs(
@@ -104,8 +102,10 @@ def end_costs(
     seen, rest = take_rows(seen, slice(-1, None)), take_rows(felt, slice(-1, None))
     before = put_down(felt, fps)
     lets_go = any(stored in goal for stored in CARRIED.values())
-    at = carried_row(felt, before) if before is not None or lets_go else -1
-    carried = take_rows(felt, slice(at, at + 1 or None))
+    carried = rest
+    if before is not None or lets_go:
+        at = carried_row(felt, before)
+        carried = take_rows(felt, slice(at, at + 1))
     resting = RESTING if "wrist" in goal else (*cameras_of(goal), *RESTING)
     costs = _some(part_costs({**seen, **rest}, goal, units), resting)
     costs |= _some(_carried_costs(carried, goal, units), _CARRIED)

@@ -38,8 +38,7 @@ def write_frames(
     """Write `frames.parquet` from the records at `paths`, one after the other.
 
     `next.reward` is the potential-based reward of the step from a frame to the next one, of the main
-    curve; 0 at the last frame. A value that a trajectory lacks is NaN. Of normalised
-    costs `touchgoal_progress.parquet` is written, too: 1 - cost of the main curve.
+    curve; 0 at the last frame. A value that a trajectory lacks is NaN.
     """
     names = list(dict.fromkeys(name for one in facts for name in one.columns))
     signals = [_TIME, *map(_signal, names), _NEXT_REWARD]
