@@ -20,6 +20,8 @@ from typing import Any, Protocol, runtime_checkable
 from touchgoal.control.interfaces import DriverError
 from touchgoal.runtime.errors import UserError
 
+CALL_TIMEOUT = 1.5  # s that a call may take
+PATIENT = 60.0  # s instead on a twin in lock-step, where nothing moves in the meantime
 _GRACE = 1.0  # s that the kernel's alarm waits beyond the parent's time-out
 _CLOSING = 3.0  # s to bring an arm to rest and disconnect
 NEVER = 1e6  # s, period of a driver that ticks on request alone
@@ -49,9 +51,14 @@ class DriverProcess:
     """
 
     def __init__(
-        self, driver: Callable[..., Driver], *args: Any, connect_timeout: float = 30.0
+        self,
+        driver: Callable[..., Driver],
+        *args: Any,
+        connect_timeout: float = 30.0,
+        call_timeout: float = CALL_TIMEOUT,
     ) -> None:
         self._name, self._lock = driver.__qualname__, threading.Lock()
+        self._call_timeout = call_timeout
         self.exit_reason = ""
         self._output = tempfile.TemporaryFile()
         self._pipe, theirs = Pipe()
@@ -72,9 +79,10 @@ class DriverProcess:
         """Whether the process runs."""
         return self._process.poll() is None
 
-    def call(self, method: str, *args: Any, timeout: float = 1.5) -> Any:
+    def call(self, method: str, *args: Any, timeout: float | None = None) -> Any:
         """Return the method's result; DriverError if it fails, or takes too long and is killed."""
-        return self._exchange((method, args, timeout), timeout, method)
+        seconds = self._call_timeout if timeout is None else timeout
+        return self._exchange((method, args, seconds), seconds, method)
 
     def close(self) -> None:
         """Let the driver bring its device to rest, then end it, by force if need be."""
