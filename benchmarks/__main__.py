@@ -68,6 +68,7 @@ BENCHMARKS = {
     "faults": ("deployment.faults", "what a deployment does under every fault"),
     "policy-delay": ("deployment.policy_delay", "success under delays, or by cause of failure"),
     "own-task": ("deployment.own_task", "a task known by demonstrations alone: success by sight"),
+    "audit": ("deployment.audit", "success with touch removed, shuffled, or of another fingertip"),
     "robustness": ("deployment.robustness", "success under changes that training has not shown"),
     "encoder-speed": ("speed.encoder_speed", "touch embeddings a second"),
     "env-speed": ("speed.env_speed", "steps of the environment a second"),
@@ -75,6 +76,7 @@ BENCHMARKS = {
         "speed.large_sets",
         "opening, joining and going through sets of a million episodes",
     ),
+    "loader-speed": ("speed.loader_speed", "training samples a second, beside lerobot's loader"),
     "policy-latency": ("speed.policy_latency", "time of a plan, stage by stage"),
     "tactile-speed": ("speed.tactile_speed", "simulated tactile images a second"),
 }
