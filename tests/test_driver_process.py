@@ -59,10 +59,11 @@ PARENT = """
 import sys
 from odd_driver import Odd
 from touchgoal.control.arms.driver_process import DriverProcess
-child = DriverProcess(Odd, sys.argv[1])
+seconds = 1.0 if sys.argv[2:] == ["short"] else 60.0
+child = DriverProcess(Odd, sys.argv[1], call_timeout=seconds)
 print("ready", flush=True)
 if sys.argv[2:]:
-    child.call("hang", timeout=1.0 if sys.argv[2] == "short" else 60.0)
+    child.call("hang")
 sys.stdin.read()
 """
 
@@ -77,10 +78,10 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "log"
 
 
-def odd(log: Path, mood: str = "", connect_timeout: float = 60.0) -> DriverProcess:
+def odd(log: Path, mood: str = "", **timeouts: float) -> DriverProcess:
     from odd_driver import Odd  # pyright: ignore[reportMissingImports]
 
-    return DriverProcess(Odd, str(log), mood, connect_timeout=connect_timeout)
+    return DriverProcess(Odd, str(log), mood, **{"connect_timeout": 60.0, **timeouts})
 
 
 def pid(log: Path) -> int:
@@ -113,10 +114,10 @@ def test_a_library_that_hangs_is_ended(log: Path) -> None:
         odd(log, "hangs at once", connect_timeout=3.0)
     assert not running(pid(log))
     log.unlink()
-    child = odd(log)
+    child = odd(log, call_timeout=0.3)
     for _ in range(2):
         with pytest.raises(DriverError, match="did not hang within 0.3 s"):
-            child.call("hang", timeout=0.3)
+            child.call("hang")
     assert not running(pid(log)) and not child.alive
     child.close()
 

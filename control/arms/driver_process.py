@@ -58,7 +58,7 @@ class DriverProcess:
         call_timeout: float = CALL_TIMEOUT,
     ) -> None:
         self._name, self._lock = driver.__qualname__, threading.Lock()
-        self._call_timeout = call_timeout
+        self._timeout = call_timeout
         self.exit_reason = ""
         self._output = tempfile.TemporaryFile()
         self._pipe, theirs = Pipe()
@@ -79,10 +79,9 @@ class DriverProcess:
         """Whether the process runs."""
         return self._process.poll() is None
 
-    def call(self, method: str, *args: Any, timeout: float | None = None) -> Any:
+    def call(self, method: str, *args: Any) -> Any:
         """Return the method's result; DriverError if it fails, or takes too long and is killed."""
-        seconds = self._call_timeout if timeout is None else timeout
-        return self._exchange((method, args, seconds), seconds, method)
+        return self._exchange((method, args, self._timeout), self._timeout, method)
 
     def close(self) -> None:
         """Let the driver bring its device to rest, then end it, by force if need be."""
