@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -58,7 +58,7 @@ class Config(BenchmarkOptions):
     train: str = "--preset sight"
     """Options of train-policy."""
     workers: Count = CORES
-    """Filters side by side."""
+    """Filters side by side; twins of the trials before."""
 
 
 @dataclass(frozen=True)
@@ -110,15 +110,20 @@ class _Lab:
             known.append(true)
             write_json(file, known)
 
-    def success(self, policy: Path) -> SuccessRate:
-        """Return the success of a policy in the trials."""
-        file = policy.parent / "trials.json"
-        if not file.exists():
-            drawn = range(_TRIED, _TRIED + self.config.trials)
+    def success(self, policy: Path, twins: int = 1) -> SuccessRate:
+        """Return the success of a policy in the trials, which several twins share."""
+        file, last = policy.parent / "trials.json", _TRIED + self.config.trials
+
+        def tried(k: int) -> list[bool]:
+            lab = replace(self, number=self.number + len(get_args(Filter)) * k)
             with TemporaryDirectory() as name:
-                write_json(file, list(self.run(policy, drawn, Path(name))))
-        tried = parse_json(file.read_bytes())
-        return SuccessRate(sum(tried), len(tried))
+                return list(lab.run(policy, range(_TRIED + k, last, twins), Path(name)))
+
+        if not file.exists():
+            with ThreadPoolExecutor(twins) as pool:
+                write_json(file, [true for of in pool.map(tried, range(twins)) for true in of])
+        true = parse_json(file.read_bytes())
+        return SuccessRate(sum(true), len(true))
 
     def improve(self, name: Filter, data: Path, validation: Path, rounds: int) -> Improvement:
         """Return what goes through rounds with a filter; no round is done yet."""
@@ -170,7 +175,7 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
             "rounds": [sum(true[i : i + config.runs]) for i in range(0, len(true), config.runs)],
         }
 
-    before = lab.success(first.policy(0))
+    before = lab.success(first.policy(0), config.workers)
     with ThreadPoolExecutor(config.workers) as pool:
         rows = dict(zip(config.filters, pool.map(improved, enumerate(config.filters)), strict=True))
     lines = [

@@ -76,7 +76,11 @@ def _lerobot(config: Config, root: Path, out: Path) -> dict[str, Any]:
 
 def _ours(root: Path) -> tuple[float, float, int]:
     """Return the seconds of the first and of a further epoch, and its samples."""
-    start, episodes, touch = time.perf_counter(), EpisodeSet(root), load_touch("gelsight_mini")
+    start, episodes, touch = (
+        time.perf_counter(),
+        EpisodeSet(root),
+        load_touch("gelsight_mini_markers_mae"),
+    )
     policy = PolicyConfig(touch.dim, touch.name, control_hz=episodes.fps)
     recordings = load_recordings(episodes, range(len(episodes)), policy, touch)
     windows = SequenceDataset(recordings, policy)
