@@ -9,7 +9,7 @@ CODE := runtime control sim_envs episodes encoders rewards policies benchmarks l
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test interop interop-lerobot lint check format build docs images typings weights weights-markers maze-policy maze-wrench-policy pick-place-policy pose-estimator fragile-carry clean
+.PHONY: setup demo test interop interop-lerobot lint check format build docs images typings weights weights-markers maze-policy maze-wrench-policy pick-place-policy fragile-carry-policy pose-estimator fragile-carry clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -221,6 +221,17 @@ maze-wrench-policy: $(READY)
 	rm -rf policies/weights/bead_maze_wrench && cp -r $(RUN)/policy/policy policies/weights/bead_maze_wrench
 	mv policies/weights/bead_maze_wrench/touch/* encoders/weights/gelsight_mini_markers_mae/
 	rmdir policies/weights/bead_maze_wrench/touch
+
+# The rod's slip and weight are felt: no cameras. 20 minutes on 2 cores.
+fragile-carry-policy: RUN := runs/fragile_carry
+fragile-carry-policy: LEARN := train-policy --task fragile-carry --representation base_twist --position-noise 0 \
+	--arm-state commanded --observation-horizon 4 --head regression --train.lr 1e-3 --train.epochs 20 $(TOUCH)
+fragile-carry-policy: $(READY)
+	$(call record,val,20,100000,--task fragile-carry)
+	$(call record,train,151,0,--task fragile-carry)
+	$(call train,policy,$(LEARN) --trials 24)
+	rm -rf policies/weights/fragile_carry && cp -r $(RUN)/policy/policy policies/weights/fragile_carry
+	rm -r policies/weights/fragile_carry/touch
 
 # Without an NVIDIA GPU torch comes from its own index, if that can be reached: 0.2 GB, no CUDA.
 CPU_TORCH ?= https://download.pytorch.org/whl/cpu

@@ -20,7 +20,11 @@ from touchgoal.sim_envs.config import CameraPlacement
 TOUCH, ESTIMATOR = "touch", "estimator"  # folders beside a policy's weights
 EPISODE_OBJECT = "{object}"  # in a target: the object that the simulated episode asks for
 _WEIGHTS = Path(__file__).parent / "weights"
-SHIPPED_POLICIES = {"pick-place": _WEIGHTS / "pick_place", "bead-maze": _WEIGHTS / "bead_maze"}
+SHIPPED_POLICIES = {
+    "pick-place": _WEIGHTS / "pick_place",
+    "bead-maze": _WEIGHTS / "bead_maze",
+    "fragile-carry": _WEIGHTS / "fragile_carry",
+}
 """The shipped policies: each is named after its task."""
 FURTHER_POLICIES = {"bead-maze-wrench": _WEIGHTS / "bead_maze_wrench"}
 """Further shipped policies: the maze's baseline, a regression on wrenches read from the embedding."""

@@ -26,6 +26,7 @@ POLICIES = {
     "shipped": "the learned policy that ships for the task",
     "pick-place": "the learned policy that ships for pick-place",
     "bead-maze": "the learned policy that ships for bead-maze",
+    "fragile-carry": "the learned policy that ships for fragile-carry; in simulation alone",
     "bead-maze-wrench": "bead-maze: the baseline, a regression on wrenches read from touch",
 }
 """Names of policies, and what they are."""

@@ -11,6 +11,7 @@ from benchmarks.deployment.trials import UNCHANGED
 from touchgoal.control.features import TACTILE
 from touchgoal.control.interfaces import Actor
 from touchgoal.episodes.recording import EpisodeSpec
+from touchgoal.sim_envs.config import FragileCarryConfig
 
 TICKS = 8
 
@@ -31,7 +32,7 @@ def test_each_row_changes_touch_as_it_says(monkeypatch: pytest.MonkeyPatch) -> N
         return str(spec.seed)
 
     monkeypatch.setattr(audit, "run_trial", run_trial)
-    rows = audit._audit(None, lambda _: Feels(), (EpisodeSpec(0), EpisodeSpec(3)))
+    rows = audit._audit(FragileCarryConfig(), lambda _: Feels(), (EpisodeSpec(0), EpisodeSpec(3)))
     own = [(0, tick, 0) for tick in range(TICKS)]
     by_name = dict(zip(rows, [felt[0], *felt[2:]], strict=True))
     assert by_name[UNCHANGED] == own

@@ -10,12 +10,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast, get_args
 
 import numpy as np
 
-from benchmarks.deployment.trials import TABLE_HEAD, UNCHANGED, DeployedOptions, table_row
+from benchmarks.deployment.trials import (
+    TABLE_HEAD,
+    UNCHANGED,
+    DeployedOptions,
+    TrialOptions,
+    table_row,
+)
 from touchgoal.control import features as ft
+from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
 from touchgoal.episodes.recording import EpisodeSpec
@@ -24,15 +31,18 @@ from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trial,
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.config import TaskConfig
+from touchgoal.sim_envs.config import ENVS, TaskConfig, TaskName
 
 Change = Callable[[Observation, int], Observation]
 """Returns the tactile images that a policy sees at a tick, from those that are there."""
 
 
 @checked_dataclass
-class Config(DeployedOptions):
+class Config(TrialOptions):
     """Options of benchmark audit."""
+
+    tasks: tuple[TaskName, ...] = get_args(TaskName)
+    """Tasks; all that a twin serves are as deployed."""
 
 
 @dataclass
@@ -54,9 +64,11 @@ class _Watched(Actor):
 
 def run(config: Config) -> dict[str, Any]:
     """Return success and force by task and change of touch, with the trials."""
-    lines, rows = [TABLE_HEAD], []
+    lines, rows, served = [TABLE_HEAD], [], DeployedOptions()
     for task in config.tasks:
-        make, env = prepare_policy(config.policy, config.environment(task))
+        is_served = task in get_args(SimulatedTask)
+        wanted = served.environment(cast(SimulatedTask, task)) if is_served else ENVS[task]
+        make, env = prepare_policy(config.policy, wanted)
         pairs = list(pairwise(trial_specs(env, config.episodes + 1, config.seed)))
         with parallel_map(partial(_audit, env, make), pairs, config.workers) as found:
             trials = list(track(found, f"{task}: audit", "episode", total=len(pairs)))

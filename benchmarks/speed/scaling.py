@@ -48,20 +48,20 @@ def run(config: Config) -> dict[str, Any]:
     task = PickPlaceConfig(cameras=())
     episode = record_encoded(task, expert_alone, EpisodeSpec(0, options=task.reset_options(1)[0]))
     with tempfile.TemporaryDirectory(prefix="scaling-") as name:
-        writer_rate = _timed(partial(_write, Path(name) / "alone", [episode] * _ITEMS), _ITEMS)
+        write = partial(_write, Path(name) / "alone", [episode] * _ITEMS)
+        ceilings = {"writer": _timed(write, _ITEMS)}
+        with _cluster(_FEW) as address:
+            for what, work in (("head", _byte), ("object store", partial(_work, 0.0, episode))):
+                _drain(work, range(_FEW), address)  # starts the workers
+                ceilings[what] = _timed(partial(_drain, work, range(_ITEMS), address), _ITEMS)
         rates = {}
         for workers in sorted({*config.counts, config.predicted}):
             with _cluster(workers) as address:
-                work = partial(_work, config.seconds, episode)
-                count = config.rounds * workers
-                _drain(work, range(workers), address)  # starts the workers
+                work, count = partial(_work, config.seconds, episode), config.rounds * workers
+                _drain(work, range(workers), address)
                 record = partial(_record, Path(name) / str(workers), work, range(count), address)
                 rates[workers] = _timed(record, count)
-                if workers == _FEW:
-                    head = _timed(partial(_drain, _byte, range(_ITEMS), address), _ITEMS)
-                    send = partial(_work, 0.0, episode)
-                    store = _timed(partial(_drain, send, range(_ITEMS), address), _ITEMS)
-    return _told(config, rates, {"head": head, "object store": store, "writer": writer_rate})
+    return _told(config, rates, ceilings)
 
 
 def _told(config: Config, rates: dict[int, float], ceilings: dict[str, float]) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def _cluster(workers: int) -> Iterator[str]:
         raise UserError("pip install 'touchgoal[ray]', which is measured here") from error
     cluster = Cluster(True, head_node_args={"num_cpus": workers, "include_dashboard": False})
     try:
-        yield cluster.address
+        yield str(cluster.address)
     finally:
         cluster.shutdown()
 
