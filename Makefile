@@ -225,7 +225,7 @@ maze-wrench-policy: $(READY)
 # The rod's slip and weight are felt: no cameras. 20 minutes on 2 cores.
 fragile-carry-policy: RUN := runs/fragile_carry
 fragile-carry-policy: LEARN := train-policy --task fragile-carry --representation base_twist --position-noise 0 \
-	--arm-state commanded --observation-horizon 4 --head regression --train.lr 1e-3 --train.epochs 20 $(TOUCH)
+	--arm-state commanded --observation-horizon 4 --head regression --train.lr 1e-3 --train.epochs 20 --refuse-unknown-touch $(TOUCH)
 fragile-carry-policy: $(READY)
 	$(call record,val,20,100000,--task fragile-carry)
 	$(call record,train,151,0,--task fragile-carry)

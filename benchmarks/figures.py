@@ -52,6 +52,17 @@ def mended(metrics: Metrics) -> str:
     return "; ".join(rows)
 
 
+def audited(metrics: Metrics) -> str:
+    """Success by task: unchanged, and the most with any change of touch."""
+    tasks: dict[str, list[SuccessRate]] = {}
+    for row in metrics["rows"]:
+        tasks.setdefault(row["what"].split(", ")[0], []).append(_rate(row["trials"]))
+    return "; ".join(
+        f"{task} {whole}, changed at most {max(changed, key=lambda rate: rate.successes)}"
+        for task, (whole, *changed) in tasks.items()
+    )
+
+
 def maze(metrics: Metrics, **names: str) -> str:
     """Success of closed-loop rows, by label and the row's name or a part that no other has."""
     found, rows = [], metrics["closed_loop"]
@@ -128,6 +139,20 @@ def large_sets(metrics: Metrics) -> str:
     """Seconds and memory to open a large set, and seconds to open many sets as one."""
     large, many = metrics["one"][0], metrics["many"][0]
     return f"{large['seconds']:.0f} s, {large['megabytes'] / 1000:.1f} GB; {many['seconds']:.0f} s"
+
+
+def loaders(metrics: Metrics) -> str:
+    """Rates of lerobot's loader, of a first epoch and of a whole training, in samples a second."""
+    lerobot, _, first, _, whole = metrics["rates"].values()
+    return f"lerobot {lerobot:.0f}; first epoch {first:.0f}; whole training {whole:,.0f} a second"
+
+
+def scaled(metrics: Metrics) -> str:
+    """Highest measured rate, and the model's error at the number of workers that it was not given."""
+    workers, most = max(metrics["rates"].items(), key=lambda pair: pair[1])
+    return (
+        f"{most:.0f} a second with {workers} workers; predicted point off by {metrics['off']:.0%}"
+    )
 
 
 def plan(metrics: Metrics) -> str:

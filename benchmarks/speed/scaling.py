@@ -76,7 +76,9 @@ def _told(config: Config, rates: dict[int, float], ceilings: dict[str, float]) -
         lines.append(f"{w:>8}{rate:>20.1f}{model[w]:>9.1f}{model[w] / rate:>13.2f}{kind}")
     lines += [f"{name} alone: {rate:.0f} a second" for name, rate in ceilings.items()]
     lines += [f"receiving and writing, one after the other: {most:.0f} a second"]
-    return {"table": "\n".join(lines), "rates": rates, "ceilings": ceilings, "added": added}
+    off = abs(model[config.predicted] / rates[config.predicted] - 1)
+    found = {"rates": rates, "ceilings": ceilings, "added": added, "off": off}
+    return {"table": "\n".join(lines), **found}
 
 
 @contextmanager
