@@ -67,7 +67,7 @@ class Config:
 def main(config: Config) -> None:
     """Check, measure what is not measured yet, and write the reports."""
     from touchgoal.episodes.keys import parse_keys
-    from touchgoal.rewards.goals import Bank, OwnFrame, parse_goal
+    from touchgoal.rewards.goals import EpisodeEnds, OwnFrame, parse_goal
     from touchgoal.rewards.measure import Measurement, embed_here, embed_on_ray, write_skipped
     from touchgoal.rewards.report.frame_table import FRAMES
     from touchgoal.rewards.report.page import PAGE
@@ -94,7 +94,7 @@ def main(config: Config) -> None:
     notices = [source.summary] if source.summary else []
     rewards = reward.prepare_source(source)
     specs = [spec for one in rewards.values() for spec in one.goals.values()]
-    if not config.goal and any(isinstance(spec, Bank) for spec in specs):
+    if not config.goal and any(isinstance(spec, EpisodeEnds) for spec in specs):
         notices.append(
             "failures are among the episodes: the goal is the nearest end of other successes"
         )

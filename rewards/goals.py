@@ -9,7 +9,7 @@ Without touch, and with towers that were trained together (a CLIP), a sentence i
 import hashlib
 import math
 import re
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -129,65 +129,51 @@ class TouchArrays:
 
 
 @dataclass(frozen=True)
-class EpisodeEnd:
-    """The last frame of episode `index` of the episode set in `root`."""
+class EpisodeEnds:
+    """The last frame of episode `index` of the episode set in `root`, or of each of its successes.
 
-    root: Path
-    index: int
-    keys: Mapping[str, str] = field(default_factory=dict, hash=False)  # as for `EpisodeSet`
-    modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
-
-    def __str__(self) -> str:
-        return f"episode:{self.root}#{self.index}"
-
-    def ends(self) -> list["EpisodeEnd"]:
-        """Return itself, as a `Bank` returns several."""
-        return [self]
-
-    def read(self, keys: Sequence[str] = (), also: Sequence[str] = ()) -> Episode:
-        """Return the first frames (for the background of touch) and, last, the last frame.
-
-        The simulator's contact, the wrench and `also` are added where they are recorded. UserError: no
-        such set, episode or key.
-        """
-        episodes = EpisodeSet(self.root, keys=self.keys)
-        if self.index >= len(episodes):
-            raise UserError(
-                f"goal '{self}' does not exist: {self.root} has episodes 0 to {len(episodes) - 1}"
-            )
-        length = episodes.lengths[self.index]
-        wanted = dict.fromkeys((*also, ft.TRUTH_CONTACT, ft.WRENCH, ft.TCP_POSE))
-        more = [key for key in wanted if key in episodes.features and key not in keys]
-        frames = [*range(min(START_FRAMES, length)), length - 1]
-        return episodes.read(self.index, [*keys, *more], frames)
-
-
-@dataclass(frozen=True)
-class Bank:
-    """The ends of all successful episodes of the set in `root`; the nearest counts, softly.
-
-    Where objects are recorded, those with the object of the trajectory.
+    Of several the nearest counts, softly; where objects are recorded, those with the object of the
+    trajectory.
     """
 
     root: Path
+    index: int | None = None  # None: every episode that is marked as a success
     keys: Mapping[str, str] = field(default_factory=dict, hash=False)  # as for `EpisodeSet`
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
-        return f"bank:{self.root}"
+        return f"bank:{self.root}" if self.index is None else f"episode:{self.root}#{self.index}"
 
-    def ends(self) -> list[EpisodeEnd]:
-        """Return the ends; UserError: no such set, or no episode marked as a success."""
+    def read(
+        self, keys: Sequence[str] = (), also: Sequence[str] = ()
+    ) -> Iterator[tuple[str, Episode]]:
+        """Yield each one's name, and its first frames (for the background of touch) and, last, its last.
+
+        The simulator's contact, the wrench and `also` are added where they are recorded. UserError: no
+        such set, episode or key, or no episode marked as a success.
+        """
         episodes = EpisodeSet(self.root, keys=self.keys)
-        found = [i for i in range(len(episodes)) if episodes.meta(i).get("success") is True]
-        if not found:
+        if self.index is None:
+            chosen = [i for i in range(len(episodes)) if episodes.meta(i).get("success") is True]
+        elif self.index < len(episodes):
+            chosen = [self.index]
+        else:
+            raise UserError(
+                f"goal '{self}' does not exist: {self.root} has episodes 0 to {len(episodes) - 1}"
+            )
+        if not chosen:
             raise UserError(f"goal '{self}': no episode of {self.root} is marked as a success")
-        return [EpisodeEnd(self.root, i, self.keys) for i in found]
+        wanted = dict.fromkeys((*also, ft.TRUTH_CONTACT, ft.WRENCH, ft.TCP_POSE))
+        more = [key for key in wanted if key in episodes.features and key not in keys]
+        for i in chosen:
+            length = episodes.lengths[i]
+            frames = [*range(min(START_FRAMES, length)), length - 1]
+            yield str(replace(self, index=i)), episodes.read(i, [*keys, *more], frames)
 
 
 @dataclass(frozen=True)
 class GoalFile:
-    """Embedded ends of successes in a file, which fit-normalizer wrote: used as a `Bank`."""
+    """Embedded ends of successes in a file, which fit-normalizer wrote: used as an `EpisodeEnds`."""
 
     path: Path
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
@@ -231,10 +217,9 @@ class GripForce:
 
 def content_checksum(spec: "GoalSpec") -> str:
     """Return a text that changes when what a goal refers to does: its image, episodes or file."""
-    if isinstance(spec, EpisodeEnd):
-        return EpisodeSet(spec.root, keys=spec.keys).episode_checksum(spec.index)
-    if isinstance(spec, Bank):
-        return EpisodeSet(spec.root, keys=spec.keys).checksum
+    if isinstance(spec, EpisodeEnds):
+        of = EpisodeSet(spec.root, keys=spec.keys)
+        return of.checksum if spec.index is None else of.episode_checksum(spec.index)
     if isinstance(spec, GoalFile):
         return hashlib.sha256(spec.path.read_bytes()).hexdigest()
     if isinstance(spec, GoalImage):
@@ -242,7 +227,7 @@ def content_checksum(spec: "GoalSpec") -> str:
     return str(spec)
 
 
-GoalSpec = OwnFrame | GoalImage | TouchArrays | EpisodeEnd | Bank | GoalFile | Sentence | GripForce
+GoalSpec = OwnFrame | GoalImage | TouchArrays | EpisodeEnds | GoalFile | Sentence | GripForce
 Goals = Mapping[Modality, GoalSpec]
 """The goal of each modality that has one."""
 GoalLike = GoalSpec | str | int | np.ndarray | Mapping[str, np.ndarray]
@@ -270,9 +255,9 @@ def parse_goal(text: str, keys: Mapping[str, str] | None = None) -> GoalSpec:
     if kind == "image" and value:
         return GoalImage(Path(value))
     if kind == "episode" and (episode := re.fullmatch(r"(.+)#(\d+)", value)):
-        return EpisodeEnd(Path(episode[1]), int(episode[2]), keys or {})
+        return EpisodeEnds(Path(episode[1]), int(episode[2]), keys or {})
     if kind == "bank" and value:
-        return Bank(Path(value), keys or {})
+        return EpisodeEnds(Path(value), keys=keys or {})
     if kind == "goal" and value:
         return GoalFile(Path(value))
     if kind == "text" and value:
@@ -355,9 +340,8 @@ def check_goals(goals: Goals, inputs: Inputs) -> None:
             frame_index(spec, inputs.length, inputs.name)
         if isinstance(spec, GoalImage):
             spec.read()
-        if isinstance(spec, EpisodeEnd | Bank):
-            read = [inputs.camera or ft.FRONT] if modality == "image" else inputs.sides
-            spec.ends()[0].read(read)
+        if isinstance(spec, EpisodeEnds):
+            next(spec.read([inputs.camera or ft.FRONT] if modality == "image" else inputs.sides))
         if isinstance(spec, GoalFile) and not spec.path.is_file():
             raise UserError(f"goal '{spec}' does not exist: write one with fit-normalizer")
 

@@ -20,7 +20,7 @@ from touchgoal.episodes.keys import parse_keys
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
-from touchgoal.rewards.goals import EpisodeEnd, parse_goal
+from touchgoal.rewards.goals import EpisodeEnds, parse_goal
 from touchgoal.runtime.errors import UserError
 
 TOP = "observation.images.top"
@@ -127,7 +127,8 @@ def test_keys_rename_features_of_a_set_and_of_goals(foreign: Path) -> None:
     keys = parse_keys([f"{TOP}={ft.FRONT}"])
     assert {TOP, ft.FRONT} & EpisodeSet(foreign, keys=keys).features.keys() == {ft.FRONT}
     goal = parse_goal(f"episode:{foreign}#0", keys)
-    assert isinstance(goal, EpisodeEnd) and goal.read([ft.FRONT]).frames[ft.FRONT].ndim == 4
+    assert isinstance(goal, EpisodeEnds)
+    assert next(goal.read([ft.FRONT]))[1].frames[ft.FRONT].ndim == 4
     assert ft.FRONT not in EpisodeSet(foreign).features, "another set is not affected"
 
 

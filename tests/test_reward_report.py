@@ -25,7 +25,7 @@ from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.rewards.curves import Contact, Curves
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
-from touchgoal.rewards.goals import Bank, OwnFrame
+from touchgoal.rewards.goals import EpisodeEnds, OwnFrame
 from touchgoal.rewards.measure import Measurement, embed_here, write_skipped
 from touchgoal.rewards.metrics import measure_curve
 from touchgoal.rewards.report.page import write_pages
@@ -182,7 +182,7 @@ def test_a_mistake_comes_without_a_notice_before_it(
 def test_no_failure_is_measured_to_its_own_end(episodes: Path, tmp_path: Path) -> None:
     source = open_source(episodes, "front")
     goals = default_goals(source.trajectories)
-    assert list(goals.values()) == [Bank(episodes)] * 3 + [OwnFrame()]  # the only can
+    assert list(goals.values()) == [EpisodeEnds(episodes)] * 3 + [OwnFrame()]  # the only can
     assert set(default_goals(source.trajectories[:2]).values()) == {OwnFrame()}
     write_video(tmp_path / "x.mp4", EPISODE.frames[FRONT], 25)
     (tmp_path / "labels.csv").write_text("file,outcome\nx.mp4,drop\n")

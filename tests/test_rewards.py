@@ -21,7 +21,7 @@ from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, separating
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal, take_rows
 from touchgoal.rewards.goals import (
-    EpisodeEnd,
+    EpisodeEnds,
     GoalImage,
     GripForce,
     Modality,
@@ -86,7 +86,7 @@ def goal_of(episode: EmbeddedEpisode, *names: str) -> EmbeddedGoal:
         ("last", OwnFrame()),
         ("frame:0", OwnFrame(0)),
         ("image:ends/cup.png", GoalImage(Path("ends/cup.png"))),
-        ("episode:data/a#b#12", EpisodeEnd(Path("data/a#b"), 12)),
+        ("episode:data/a#b#12", EpisodeEnds(Path("data/a#b"), 12)),
         ("text:hard, smooth: round", Sentence("hard, smooth: round")),
         ("force:3.5", GripForce(3.5)),
     ],

@@ -41,8 +41,7 @@ from touchgoal.rewards.features.embedded import (
 from touchgoal.rewards.features.steady_images import STEADY, steady_images
 from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.goals import (
-    Bank,
-    EpisodeEnd,
+    EpisodeEnds,
     GoalFile,
     GoalImage,
     Goals,
@@ -93,7 +92,7 @@ class EpisodeEmbedder:
         self.knows_words = self._aligned is not None  # touch can be compared with sentences
         self.camera, self.parts = camera, parts
         # by the keys that are read, too
-        self._ends: dict[tuple[EpisodeEnd | Bank | GoalFile, tuple[str, ...]], SuccessfulEnds] = {}
+        self._ends: dict[tuple[EpisodeEnds | GoalFile, tuple[str, ...]], SuccessfulEnds] = {}
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
         name = STEADY if isinstance(towers, OfflineTowers) else towers.name.rpartition("#")[2]
         self._images_with = EmbeddingSource(name, camera)
@@ -267,29 +266,28 @@ class EpisodeEmbedder:
             }
             end = self.stream(frames, own.fps, str(spec)).embed(frames)
             return split_features(last_rows([end]))
-        assert isinstance(spec, EpisodeEnd | Bank | GoalFile)
+        assert isinstance(spec, EpisodeEnds | GoalFile)
+        alone = isinstance(spec, EpisodeEnds) and spec.index is not None
         cameras = tuple(
             key
             for key in dict.fromkeys((self.camera, *CAMERAS))
             if key == self.camera or camera_name(key) in own.features
         )
         keys = (*cameras, *own.sides)
-        if isinstance(spec, EpisodeEnd):  # which may lack what other goals are for
+        if alone:  # which may lack what other goals are for
             keys = own.sides if modality == "tactile" else cameras
         if (known := (spec, keys)) not in self._ends:
             self._ends[known] = self._embed_ends(spec, keys, own.fps)
         ends = self._ends[known]
-        if isinstance(spec, EpisodeEnd):
-            return split_features(ends.features)
-        return split_features(ends.for_trajectory(own, str(spec)))
+        return split_features(ends.features if alone else ends.for_trajectory(own, str(spec)))
 
     def _embed_ends(
-        self, spec: EpisodeEnd | Bank | GoalFile, keys: tuple[str, ...], fps: float
+        self, spec: EpisodeEnds | GoalFile, keys: tuple[str, ...], fps: float
     ) -> SuccessfulEnds:
         if isinstance(spec, GoalFile):
             return SuccessfulEnds.load(spec.path)
-        ends = [self.embed_episode(end.read(also=keys), fps, str(end)) for end in spec.ends()]
-        return SuccessfulEnds.of(ends)
+        read = spec.read(also=keys)
+        return SuccessfulEnds.of([self.embed_episode(end, fps, name) for name, end in read])
 
 
 class FeatureStream:

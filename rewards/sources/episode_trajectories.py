@@ -14,7 +14,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.rewards.distance.normalizer import scene_of
 from touchgoal.rewards.features.embedded import ARM
-from touchgoal.rewards.goals import Bank, GoalSpec, Inputs, OwnFrame, missing_camera
+from touchgoal.rewards.goals import EpisodeEnds, GoalSpec, Inputs, OwnFrame, missing_camera
 from touchgoal.rewards.sources.trajectory import Skipped, Source, Trajectory, frames_per_chunk
 from touchgoal.runtime.errors import UserError
 
@@ -162,5 +162,5 @@ def default_goals(trajectories: Sequence[Trajectory]) -> dict[str, GoalSpec]:
                 f"{t.source} ({what or 'unknown'}): give a goal, --goal episode:SET#K"
             )
         alone = successes[what] == [t.index]
-        goals[t.name] = OwnFrame() if alone else Bank(root, of.keys)
+        goals[t.name] = OwnFrame() if alone else EpisodeEnds(root, keys=of.keys)
     return goals
