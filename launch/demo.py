@@ -68,7 +68,7 @@ def main(config: Config) -> None:
     env.close()
     held = until_release(episode)
     EpisodeWriter(out / "episodes", hz).append(held)
-    embedded = reward.embedder.embed_episode(held, hz, str(held.meta["object"]))
+    embedded = reward.embedder.embed_chunks([held], hz, str(held.meta["object"]))
     curves = reward.curves(embedded)
     judged = Reward.of_judge(SHIPPED_JUDGE).prepare(inputs).judge_episode(embedded)
     write_report(curves, out, "curves", reward.provenance())

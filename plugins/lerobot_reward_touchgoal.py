@@ -120,7 +120,7 @@ class TouchgoalRewardModel(PreTrainedRewardModel):
         reward = self._prepare(frames)
         facts = {"object": self.config.object} if self.config.object else {}
         run = Episode(frames, self.config.task, facts)
-        embedded = reward.embedder.embed_episode(run, self.config.fps, "a run")
+        embedded = reward.embedder.embed_chunks([run], self.config.fps, "a run")
         return 1 - reward.curves(embedded).costs[FUSED]
 
     def _prepare(self, frames: dict[str, np.ndarray]) -> PreparedReward:

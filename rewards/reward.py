@@ -331,7 +331,7 @@ class Reward:
         frames = episode.frames
         goals = [g.beside(frames) if isinstance(g, TouchArrays) else g for g in self.goals]
         prepared = self.prepare(inputs, goals)
-        return prepared, prepared.embedder.embed_episode(episode, fps, inputs.name)
+        return prepared, prepared.embedder.embed_chunks([episode], fps, inputs.name)
 
 
 def _as_episode(

@@ -63,8 +63,8 @@ def test_goals_from_images_and_other_episodes(embedder: EpisodeEmbedder, tmp_pat
     writer.append(recorded(color=160))
     writer.append(recorded())
     stored = EpisodeSet(tmp_path / "set").read(1)
-    other = embedder.embed_episode(stored, 20.0, "set#1")
-    mine = embedder.embed_episode(recorded(color=160), 20.0, "mine")
+    other = embedder.embed_chunks([stored], 20.0, "set#1")
+    mine = embedder.embed_chunks([recorded(color=160)], 20.0, "mine")
     spec = parse_goal(f"episode:{tmp_path / 'set'}#1")
     end = embedder.embed_goal(assign_goals([spec], ALL), mine)
     for name in ("image", "touch"):
@@ -85,13 +85,13 @@ def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
     with pytest.raises(UserError, match="trained with the towers oil, not paint"):
         EpisodeEmbedder(PaintTowers(), encoder)
     with pytest.raises(UserError, match="starts in contact"):
-        embedder.embed_episode(recorded(contact=0), 20.0, "mine")
-    early, late = (embedder.embed_episode(recorded(contact=c), 20.0, "mine") for c in (2, 7))
+        embedder.embed_chunks([recorded(contact=0)], 20.0, "mine")
+    early, late = (embedder.embed_chunks([recorded(contact=c)], 20.0, "mine") for c in (2, 7))
     assert early.features["touch"][[0, -1]] == pytest.approx(
         late.features["touch"][[0, -1]], abs=1e-6
     )
     touch_alone = {k: v for k, v in recorded().frames.items() if k != FRONT}
-    touched = embedder.embed_episode(replace(recorded(), frames=touch_alone), 20.0, "mine")
+    touched = embedder.embed_chunks([replace(recorded(), frames=touch_alone)], 20.0, "mine")
     touched = embedder.describe(touched, recorded().meta)
     assert touched.modalities == ("tactile", "text") and len(touched) == 12
 
@@ -105,7 +105,7 @@ def test_encoders_without_words_measure_touch() -> None:
         PooledEncoder(PooledEncoderConfig.for_sensor("gelsight_mini")),
     ):
         embedder = EpisodeEmbedder(PaintTowers(), encoder)
-        e = embedder.embed_episode(recorded(), 20.0, "mine")
+        e = embedder.embed_chunks([recorded()], 20.0, "mine")
         assert embedder.describe(e, recorded().meta).modalities == ("image", "tactile")
         cost = compute_curves(e, embedder.embed_goal(goal, e), None).raw["tactile"]
         assert cost[7:] == pytest.approx(np.zeros(5), abs=1e-3)
@@ -121,7 +121,7 @@ def test_an_episode_embedded_in_chunks_is_the_whole(embedder: EpisodeEmbedder) -
         replace(whole, frames={key: v[rows] for key, v in whole.frames.items()})
         for rows in (slice(12), slice(12, 13), slice(13, 20))
     ]
-    once = embedder.embed_episode(whole, 20.0, "x")
+    once = embedder.embed_chunks([whole], 20.0, "x")
     joined = embedder.embed_chunks(chunks, 20.0, "x")
     for name, values in once.features.items():
         assert joined.features[name] == pytest.approx(values, abs=1e-5), name

@@ -89,7 +89,7 @@ def test_a_hand_that_lets_go_is_judged_by_what_it_carried(embedder: EpisodeEmbed
         32
     ]  # put down so softly that no one feels it
     let_go, holds, wrong, softly = (
-        embedder.embed_episode(replace(kept, frames=f), 20, "one")
+        embedder.embed_chunks([replace(kept, frames=f)], 20, "one")
         for f in (frames, kept.frames, other, unfelt)
     )
     ends = SuccessfulEnds.of([let_go, let_go]).features

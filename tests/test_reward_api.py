@@ -276,7 +276,7 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder) -> No
     normalizer = DistanceNormalizer(*ends, {}, embedder.made_with, "recorded, not simulated", 3)
     goals = [GoalImage(IMAGES[9]), Sentence("soft")]
     frames = {FRONT: IMAGES, TACTILE_LEFT: left, TACTILE_RIGHT: TOUCH["right"]}
-    recording = embedder.embed_episode(Episode(frames=frames, task="", meta={}), 20.0, "recording")
+    recording = embedder.embed_chunks([Episode(frames=frames, task="", meta={})], 20.0, "recording")
     goal = embedder.embed_goal(assign_goals(goals, ("image", "tactile", "text")), recording)
     expected = compute_curves(recording, goal, normalizer).parts["fused"]
     assert np.ptp(expected) > 0.05
@@ -296,7 +296,7 @@ def test_a_run_is_judged_as_its_recording_and_ends_when_it_rests(
     still[:18, 9] = 0.03  # rad/s
     frames = {FRONT: frames[FRONT], **{k: frames[k] for k in TACTILE}, STATE: still}
     embedder = EpisodeEmbedder(PaintTowers(), encoder)
-    recording = embedder.embed_episode(Episode(frames=frames, task="", meta={}), 4.0, "recording")
+    recording = embedder.embed_chunks([Episode(frames=frames, task="", meta={})], 4.0, "recording")
     ends = SuccessfulEnds.of([recording.take(slice(0, n)) for n in (10, 12)])
     ends.save(tmp_path / GOAL_FILE)
     units = {"object": 0.01, "held": 0.3, "slip": 1e-3}

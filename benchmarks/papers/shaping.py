@@ -174,7 +174,7 @@ def _fit(config: Config, out: Path) -> None:
         keys = [key for key in (*ft.CAMERAS, *ft.TACTILE, ft.WRENCH) if key in hand.seen[0]]
         episode = Episode({key: np.stack([o[key] for o in hand.seen]) for key in keys}, "", {})
         facts = {"success": success, "object": config.env.objects[0]}
-        ends.append(embedder.embed_episode(episode, CONTROL_HZ, "a goal").with_facts(facts))
+        ends.append(embedder.embed_chunks([episode], CONTROL_HZ, "a goal").with_facts(facts))
     fit_normalizer(ends, ends[0].modalities, env.task).save(out / NORMALIZER)
     SuccessfulEnds.of(ends).save(out / GOAL_FILE)
 

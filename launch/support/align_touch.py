@@ -54,7 +54,7 @@ def align_touch(config: Align) -> None:
     embedder = EpisodeEmbedder(towers, encoder)
     embedded = [
         embedder.describe(
-            embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}"), data.meta(i)
+            embedder.embed_chunks([data.read(i)], data.fps, f"{data.root}#{i}"), data.meta(i)
         )
         for i in track(successes[: config.normalizer_episodes], "normalizer", "episode")
     ]

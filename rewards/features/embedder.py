@@ -113,13 +113,6 @@ class EpisodeEmbedder:
         weights = towers.image_weights if isinstance(towers, OfflineTowers) else towers.name
         return [*asdict(self.made_with).values(), weights.rpartition("#")[2], str(self.parts)]
 
-    def embed_episode(self, episode: Episode, fps: float, source: str) -> EmbeddedEpisode:
-        """Embed an episode's cameras and fingertips.
-
-        UserError: the episode lacks the camera, or starts in contact.
-        """
-        return self.embed_chunks([episode], fps, source)
-
     def embed_chunks(
         self,
         chunks: Iterable[Episode],
@@ -128,11 +121,11 @@ class EpisodeEmbedder:
         untouched: Mapping[str, Images] | None = None,
         touch: bool = True,
     ) -> EmbeddedEpisode:
-        """Embed consecutive chunks of one episode, as `embed_episode` embeds it in one go.
+        """Embed the cameras and fingertips of one episode, given whole or in consecutive chunks.
 
         The first chunk has at least 5 frames, unless it is the whole episode. `untouched` holds frames
         of the fingertips that give their backgrounds in place of its first ones. Without `touch` their
-        contact alone is read.
+        contact alone is read. UserError: the episode lacks the camera, or starts in contact.
         """
         following = iter(chunks)
         first = next(following)
@@ -171,7 +164,7 @@ class EpisodeEmbedder:
         return replace(embedded, descriptions=self.embed_sentences(sentences))
 
     def stream(self, first: Frames, fps: float, source: str) -> "FeatureStream":
-        """Return a stream that embeds a trajectory piece by piece, as `embed_episode` in one go.
+        """Return a stream that embeds a trajectory piece by piece, as `embed_chunks` does.
 
         `first` holds at least its first frames, which set the background of the fingertips.
         UserError: no camera to measure, or fingertips that do not look untouched.
@@ -202,9 +195,9 @@ class EpisodeEmbedder:
         """
         features: dict[str, np.ndarray] = {}
         if "image" in goals:
-            features |= self._embed_goal("image", goals["image"], own)[0]
+            features |= split_features(self._embed_goal("image", goals["image"], own))[0]
         if "tactile" in goals:
-            features |= self._embed_goal("tactile", goals["tactile"], own)[1]
+            features |= split_features(self._embed_goal("tactile", goals["tactile"], own))[1]
         if isinstance(text := goals.get("text"), Sentence):
             features[TEXT] = self.embed_sentences([text.text])
         if isinstance(force := goals.get("force"), GripForce):
@@ -228,44 +221,27 @@ class EpisodeEmbedder:
             features[IMAGE] = features[camera_name(self.camera)]
         return features
 
-    def embed_touch(
-        self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
-    ) -> Float32[np.ndarray, "n k"]:
-        """Return embeddings of one fingertip's images, given the same fingertip untouched.
-
-        They are unit vectors, except those of a `PooledEncoder`, which are shorter for a lighter touch
-        and so farther from a firm one.
-        """
-        assert self.encoder is not None  # without it no trajectory has sides
-        embedded = self.encoder.embed_frames(frames, background)
-        if isinstance(self.encoder, TouchBackbone):
-            embedded /= np.linalg.norm(embedded, axis=1, keepdims=True)
-        return embedded
-
     def embed_sentences(self, sentences: Sequence[str]) -> Float32[np.ndarray, "m k"]:
-        """Return unit embeddings of sentences on how touch feels, comparable with `embed_touch`."""
+        """Return unit embeddings of sentences on how touch feels, comparable with its embeddings."""
         assert self._aligned is not None  # without it no modality takes a sentence
         return self._aligned.embed_text_goal(list(sentences), self._towers)
 
-    def _embed_goal(
-        self, modality: Modality, spec: GoalSpec, own: EmbeddedEpisode
-    ) -> tuple[Features, Features]:
-        """Return the features of a goal of images, and those of a goal of touch."""
+    def _embed_goal(self, modality: Modality, spec: GoalSpec, own: EmbeddedEpisode) -> Features:
+        """Return the features of a goal; those that are not of the modality do not count."""
         if isinstance(spec, Sentence):
             assert self._towers.pretrained_together  # or a sentence is no goal for images
-            return {IMAGE: _unit(self._towers.embed_texts([spec.text]))}, {}
+            return {IMAGE: _unit(self._towers.embed_texts([spec.text]))}
         if isinstance(spec, GoalImage):
-            return self.embed_cameras({self.camera or FRONT: spec.read()}), {}
+            return self.embed_cameras({self.camera or FRONT: spec.read()})
         if isinstance(spec, OwnFrame):
             row = frame_index(spec, len(own), own.source)
-            return split_features(take_rows(own.features, slice(row, row + 1)))
+            return take_rows(own.features, slice(row, row + 1))
         if isinstance(spec, TouchArrays):
             frames = {
                 side: np.stack([*[spec.backgrounds[side]] * START_FRAMES, spec.images[side]])
                 for side in own.sides
             }
-            end = self.stream(frames, own.fps, str(spec)).embed(frames)
-            return split_features(last_rows([end]))
+            return last_rows([self.stream(frames, own.fps, str(spec)).embed(frames)])
         assert isinstance(spec, EpisodeEnds | GoalFile)
         alone = isinstance(spec, EpisodeEnds) and spec.index is not None
         cameras = tuple(
@@ -276,18 +252,14 @@ class EpisodeEmbedder:
         keys = (*cameras, *own.sides)
         if alone:  # which may lack what other goals are for
             keys = own.sides if modality == "tactile" else cameras
-        if (known := (spec, keys)) not in self._ends:
-            self._ends[known] = self._embed_ends(spec, keys, own.fps)
-        ends = self._ends[known]
-        return split_features(ends.features if alone else ends.for_trajectory(own, str(spec)))
-
-    def _embed_ends(
-        self, spec: EpisodeEnds | GoalFile, keys: tuple[str, ...], fps: float
-    ) -> SuccessfulEnds:
-        if isinstance(spec, GoalFile):
-            return SuccessfulEnds.load(spec.path)
-        read = spec.read(also=keys)
-        return SuccessfulEnds.of([self.embed_episode(end, fps, name) for name, end in read])
+        ends = self._ends.get((spec, keys))
+        if ends is None and isinstance(spec, GoalFile):
+            ends = SuccessfulEnds.load(spec.path)
+        elif ends is None:
+            read = spec.read(also=keys)
+            ends = SuccessfulEnds.of([self.embed_chunks([e], own.fps, name) for name, e in read])
+        self._ends[spec, keys] = ends
+        return ends.features if alone else ends.for_trajectory(own, str(spec))
 
 
 class FeatureStream:
@@ -321,12 +293,20 @@ class FeatureStream:
     def _embed_touch(
         self, side: str, frames: UInt8[np.ndarray, "n h w 3"]
     ) -> Float32[np.ndarray, "n k"]:
+        """Return embeddings of one fingertip's next images.
+
+        They are unit vectors, except those of a `PooledEncoder`, which are shorter for a lighter touch
+        and so farther from a firm one.
+        """
         encoder = self._embedder.encoder
         assert encoder is not None  # without it there are no sides
         past = self._past.get(side, frames[:0])
         known = np.concatenate([past, frames]) if len(past) else frames
         self._past[side] = known[len(known) - max(encoder.offsets) :]
-        return self._embedder.embed_touch(known, self._backgrounds[side])[len(past) :]
+        embedded = encoder.embed_frames(known, self._backgrounds[side])[len(past) :]
+        if isinstance(encoder, TouchBackbone):
+            embedded /= np.linalg.norm(embedded, axis=1, keepdims=True)
+        return embedded
 
 
 def _unit(embeddings: torch.Tensor) -> Float32[np.ndarray, "n d"]:

@@ -69,5 +69,5 @@ def _embed(files: EmbeddedFiles, recorded: Recorded) -> bytes:
     ]
     frames = range((episodes.lengths[i] - 1) % files.every, episodes.lengths[i], files.every)
     episode, name = episodes.read(i, keys, frames), f"{recorded.root.name}#{i}"
-    embedded = embedder.embed_episode(episode, episodes.fps / files.every, name)
+    embedded = embedder.embed_chunks([episode], episodes.fps / files.every, name)
     return pickle.dumps(embedder.describe(embedded, episode.meta))
