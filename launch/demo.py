@@ -77,7 +77,7 @@ def main(config: Config) -> None:
     write_film(film, images, episode, hz, shown, "distance to goal", curve_colors(FILMED))
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
     print(f"the judge, which sees and feels alone, says: {judged}")
-    write_json(out / "metrics.json", {k: m.as_dict() for k, m in curves.metrics().items()})
+    write_json(out / "metrics.json", curves.metrics())
     print(metrics_table([curves]))
     print(f"film: {film}\ncurves: {out / 'curves.png'}\n\n{what_next(out)}")
 

@@ -6,8 +6,7 @@ measured before the contact.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int, Real
@@ -48,10 +47,6 @@ class CurveMetrics:
     t_drop_50: int | None  # the same for 50 %, the primary one
     contact: int | None  # first contact frame, as given
     contact_lag: int | None  # t_drop_50 - contact (frames); negative if it falls before contact
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the fields by name, ready for JSON."""
-        return asdict(self)
 
 
 def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> CurveMetrics:

@@ -50,7 +50,7 @@ def facts(outcome: str, last: float, name: str = "a") -> Facts:
         name=name, source=name, index=0, offset=0, frames=9, fps=20.0, unit="", normalised=True,
         goal={}, own_goal=False, contact=None, contact_source="no touch", object="",
         outcome=outcome, success=outcome == "success" if outcome else None,
-        measured={"fused": {"end": last}}, peaks={}, shown=[], columns=[],
+        measured={"fused": measure_curve(np.array([1.0, last]), None)}, peaks={}, shown=[], columns=[],
     )  # fmt: skip
 
 
@@ -228,7 +228,7 @@ def test_outcomes_are_compared_by_goals_of_others_alone() -> None:
 
 def test_printed_tables_are_short_and_name_the_objects() -> None:
     """The fused curve and four others, a legend of what is shown, each trajectory's last cost."""
-    metrics = measure_curve(np.linspace(1, 0, 40), None).as_dict()
+    metrics = measure_curve(np.linspace(1, 0, 40), None)
     measured = {name: metrics for name in (*"abcdef", "fused")}
     some = [replace(facts("success", 0.1, name), object=name, measured=measured) for name in "xy"]
     some = [replace(one, goal={"text": "text:a hard ball"}) for one in some]

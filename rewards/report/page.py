@@ -81,7 +81,7 @@ def _page(
             "digits": 0 if field in _WHOLE else 2,
         }
         for header, (field, meaning) in COLUMNS.items()
-        if any(m[field] is not None for f in facts for m in f.measured.values())
+        if any(getattr(m, field) is not None for f in facts for m in f.measured.values())
     ]
     content = {
         "curves": names,
@@ -114,7 +114,7 @@ def _row(facts: Facts) -> dict[str, Any]:
     fields = [field for field, _ in COLUMNS.values()]
     shown = ("name", "source", "object", "outcome", "frames")
     measured = facts.measured.items()
-    metrics = {name: {k: _short(values[k]) for k in fields} for name, values in measured}
+    metrics = {name: {k: _short(getattr(m, k)) for k in fields} for name, m in measured}
     return {key: getattr(facts, key) for key in shown} | {"metrics": metrics}
 
 

@@ -6,7 +6,6 @@ are those of an uninterrupted one.
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -41,16 +40,12 @@ class Facts:
     object: str  # "" if unknown
     outcome: str  # "success", a kind of failure, or "" if unknown
     success: bool | None  # None if unknown
-    measured: dict[str, dict[str, Any]]  # metrics of each cost curve, see CurveMetrics
+    measured: dict[str, CurveMetrics]  # metrics of each cost curve
     peaks: dict[str, list[int]]  # frames of the bumps of each cost curve
     shown: list[int]  # frames that the images show
     columns: list[str]  # names of the values per frame
     # whether touch is near its goal before the first contact, and far from it later
     goal_untouched: bool = False
-
-    def metrics(self) -> dict[str, CurveMetrics]:
-        """Return the metrics of each cost curve."""
-        return {name: CurveMetrics(**values) for name, values in self.measured.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +73,7 @@ class Record:
         arrays, facts = load_features(path)
         columns, thumb = {k: arrays.pop(k) for k in facts["columns"]}, arrays.pop(_THUMB)
         sheets = {key.removeprefix(_SHEET): sheet for key, sheet in arrays.items()}
+        facts["measured"] = {k: CurveMetrics(**values) for k, values in facts["measured"].items()}
         return cls(Facts(**facts), columns, sheets, thumb)
 
 
@@ -103,7 +99,7 @@ def record_of(curves: Curves, trajectory: Trajectory, thumbnails: Thumbnails) ->
         object=str(meta.get("object", "")),
         outcome=str(meta.get("outcome") or {None: "", True: "success"}.get(success, "failure")),
         success=None if success is None else bool(success),
-        measured={name: m.as_dict() for name, m in metrics.items()},
+        measured=metrics,
         peaks={n: find_peaks(c, metrics[n].eps).tolist() for n, c in curves.costs.items()},
         shown=thumbnails.shown,
         columns=list(columns),

@@ -3,6 +3,7 @@
 import io
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,7 @@ def report_json(curves: Curves, provenance: Mapping[str, Any]) -> dict[str, Any]
         "fps": curves.fps,
         "contact": {"frame": curves.contact.frame, "label_source": curves.contact.label_source},
         "unit": curves.unit,
-        "metrics": {name: m.as_dict() for name, m in curves.metrics().items()},
+        "metrics": {name: asdict(m) for name, m in curves.metrics().items()},
         "cost": {"values": _rounded(curves.costs)},
         "state_reward": {"definition": "-cost", "values": _rounded(curves.rewards)},
         "potential_reward": {

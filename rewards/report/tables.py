@@ -43,7 +43,7 @@ def metrics_table(
     those that have it; a dash stands for one that all lack. The main curve is first; of more than
     `most` others, the first ones are shown.
     """
-    metrics = [c.metrics() for c in curves]
+    metrics = [c.measured if isinstance(c, Facts) else c.metrics() for c in curves]
     names = main_first(name for m in metrics for name in m)
     shown = names if most is None else names[: most + 1]
     rows = [["curve", *COLUMNS]]
@@ -71,7 +71,7 @@ def ends_table(facts: Sequence[Facts]) -> str:
     curves = main_first(name for f in facts for name in f.measured)[: MOST_CURVES + 1]
     rows = [["trajectory", "object", *curves]]
     for f in facts[:_LISTED]:
-        ends = (f"{f.measured[c]['end']:.2f}" if c in f.measured else "-" for c in curves)
+        ends = (f"{f.measured[c].end:.2f}" if c in f.measured else "-" for c in curves)
         rows.append([f.name, f.object or "-", *ends])
     lines = ["last cost by trajectory", *aligned(rows)]
     if len(facts) > _LISTED:
@@ -97,7 +97,7 @@ def outcome_table(facts: Sequence[Facts]) -> str:
     rows = [["curve", *(name or "unknown" for name in outcomes), "AUC"]]
     rows.append(["trajectories", *(str(sum(f.outcome == o for f in facts)) for o in outcomes), ""])
     for curve in curves:
-        last = [(f, f.measured[curve]["end"]) for f in facts if curve in f.measured]
+        last = [(f, f.measured[curve].end) for f in facts if curve in f.measured]
         by_outcome = [[end for f, end in last if f.outcome == o] for o in outcomes]
         cells = [f"{mean(ends):.2f}" if ends else "-" for ends in by_outcome]
         failures, successes = ([end for f, end in last if f.success is s] for s in (False, True))
