@@ -74,10 +74,9 @@ def main(config: Config) -> None:
     keys = parse_keys(config.keys)
     with_touch = config.towers is None or config.encoder is not None
     named, success = (config.sources, config.camera), config.assume_success
-    sources, failures = open_successes(*named, with_touch, success, keys, config.background)
-    inputs = sources[0].inputs
+    options = with_touch, success, keys, config.background
+    inputs, trajectories, failures = open_successes(*named, *options)
     embedder = Reward(encoder=config.encoder, towers=config.towers).embedder(inputs)
-    trajectories = [t for source in sources for t in source.trajectories]
     of_object = Counter(str(t.meta.get("object", "")) for t in trajectories)
     if config.judge and (n := sum(k for k in of_object.values() if k > 1)) < LEAST_SUCCESSES:
         raise UserError(

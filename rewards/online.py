@@ -116,10 +116,8 @@ class CostMeter:
         if not waiting:
             return None
         stamp, newest = waiting[-1]
-        ticks, first = (
-            [tick for _, tick in waiting] if self.judges else [newest],
-            first or (newest,),
-        )
+        first = first or (newest,)
+        ticks = [tick for _, tick in waiting] if self.judges else [newest]
         seen, known, reward = 1, self._background, self._reward
         if self._stream is None or len(first) != len(known) or first[0] is not known[0]:
             missed = len(ticks) > 1

@@ -144,10 +144,10 @@ def _training_distances(
         goals = [o for o in episodes if (o is e) == same_episode]
         if modality == "tactile":
             goals = [o for o in goals if o.object == e.object]
-        if not goals and modality != "text":
-            continue
         if modality == "text":
             d = text_distances(e.features[TOUCH], e.descriptions)
+        elif not goals:
+            continue
         elif modality == "image":
             d = cosine_distances(e.features[IMAGE], last_rows(goals)[IMAGE])
         else:

@@ -244,14 +244,10 @@ class EpisodeEmbedder:
             return last_rows([self.stream(frames, own.fps, str(spec)).embed(frames)])
         assert isinstance(spec, EpisodeEnds | GoalFile)
         alone = isinstance(spec, EpisodeEnds) and spec.index is not None
-        cameras = tuple(
-            key
-            for key in dict.fromkeys((self.camera, *CAMERAS))
-            if key == self.camera or camera_name(key) in own.features
-        )
-        keys = (*cameras, *own.sides)
+        others = [k for k in CAMERAS if k != self.camera and camera_name(k) in own.features]
+        keys = (self.camera, *others, *own.sides)
         if alone:  # which may lack what other goals are for
-            keys = own.sides if modality == "tactile" else cameras
+            keys = own.sides if modality == "tactile" else (self.camera, *others)
         ends = self._ends.get((spec, keys))
         if ends is None and isinstance(spec, GoalFile):
             ends = SuccessfulEnds.load(spec.path)

@@ -8,8 +8,9 @@ from pathlib import Path
 from touchgoal.control.features import CAMERAS, IMAGE_PREFIX
 from touchgoal.episodes.format.remote import local_folder
 from touchgoal.episodes.format.set_files import INFO
+from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.sources.episode_trajectories import EpisodeTrajectory, open_episodes
-from touchgoal.rewards.sources.trajectory import Source
+from touchgoal.rewards.sources.trajectory import Source, Trajectory
 from touchgoal.rewards.sources.video_trajectories import open_videos
 from touchgoal.runtime.errors import UserError
 
@@ -69,9 +70,10 @@ def open_successes(
     assume_success: bool,
     keys: Mapping[str, str] | None = None,
     background: Sequence[Path] = (),
-) -> tuple[list[Source], list[EpisodeTrajectory]]:
+) -> tuple[Inputs, list[Trajectory], list[EpisodeTrajectory]]:
     """Open the successful episodes of sets, or several plain videos of successes; and the sets' failures.
 
+    The inputs are those of the first one.
     With `assume_success` episodes without a recorded outcome count. UserError: as `open_source`; no
     source, sets of different tasks, cameras or sensors, or sets and videos; fewer than two successes.
     """
@@ -97,9 +99,6 @@ def open_successes(
         )
     episodes = [t for t in found if isinstance(t, EpisodeTrajectory)]
     failed = [t for t in episodes if t.meta.get("success") is False]
-    if sets:
-        chosen = [t for t in episodes if t not in failed]
-        sources = [replace(sources[0], trajectories=chosen)]
     if len(found) - len(failed) < 2:
         raise UserError("a normalizer needs at least two successful episodes or videos")
-    return sources, failed
+    return sources[0].inputs, [t for t in found if t not in failed], failed
