@@ -230,7 +230,7 @@ def _add_words(config: Words) -> None:
     from touchgoal.encoders.alignment.green_screen import background_changer
     from touchgoal.encoders.alignment.heads import fit_heads
     from touchgoal.encoders.alignment.wand_set import WandSet, is_wand_set
-    from touchgoal.encoders.alignment.words import embed_surfaces, embed_wand, with_heads
+    from touchgoal.encoders.alignment.words import embed_surfaces, embed_wand
     from touchgoal.encoders.towers.towers import load_towers
 
     encoder = pretrained.load_pooled_encoder(config.encoder)
@@ -261,7 +261,7 @@ def _add_words(config: Words) -> None:
     }
     folder = pretrained.find_encoder(config.encoder, published=False)
     before = pretrained.ENCODER_FORMAT.provenance(folder)
-    worded = with_heads(encoder, towers, heads)
+    worded = encoder.with_maps(towers, heads.text, heads.image)
     pretrained.save(worded, out / "encoder", {"words_added_to": before, **source, **provenance()})
     print(f"encoder: {out / 'encoder'}")
 

@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from touchgoal.encoders.backbones.pooled_encoder import LAST_BLOCK, STAGES, as_images, pool_stages
+from touchgoal.encoders.backbones.pooled_encoder import LAST_BLOCK, STAGES, PooledStages, as_images
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
@@ -17,7 +17,7 @@ from touchgoal.encoders.towers.towers import Towers
 _FROZEN = 3
 
 
-class EfficientNetBackbone(nn.Module):
+class EfficientNetBackbone(PooledStages):
     """The network up to stride 16; its features are means and standard deviations of three stages."""
 
     width = 2 * sum(channels for block, channels in STAGES if block <= LAST_BLOCK)
@@ -28,10 +28,8 @@ class EfficientNetBackbone(nn.Module):
         Args:
             scale: counts of change that are 1.0 in the preprocessed frames.
         """
-        super().__init__()
-        network = load_efficientnet_lite0()
-        self.stem, self.scale = network.stem, scale
-        self.blocks = nn.ModuleList(list(network.blocks)[: LAST_BLOCK + 1])
+        super().__init__(load_efficientnet_lite0(), LAST_BLOCK)
+        self.scale = scale
         for frozen in (self.stem, *self.blocks[:_FROZEN]):
             frozen.requires_grad_(False)
 
@@ -40,7 +38,7 @@ class EfficientNetBackbone(nn.Module):
     ) -> Float[Tensor, "n d"]:
         """Return the features of preprocessed frames; it has no patches to leave out."""
         assert ids_keep is None, "a convolutional network cannot leave patches out"
-        return pool_stages(self.stem, self.blocks, as_images(touch, self.scale))
+        return self(as_images(touch, self.scale))
 
 
 @dataclass(frozen=True)
@@ -102,11 +100,6 @@ class TouchEncoder(BaseTouchEncoder):
         together = config.pretrained_together
         self.image_head = None if together else nn.Linear(config.image_dim, d, bias=False)
         self.text_head = None if together else nn.Linear(config.text_dim, d, bias=False)
-
-    @property
-    def towers(self) -> str:
-        """See BaseTouchEncoder."""
-        return self.config.towers
 
     def embed_touch(
         self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None

@@ -1,7 +1,6 @@
-"""Maps of sentences and images to the embeddings of a fixed touch encoder (see `heads`)."""
+"""What the maps of sentences and images to a fixed touch encoder are fitted to (see `heads`)."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -9,7 +8,6 @@ import torch
 from touchgoal.control.arrays import Image
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.encoders.alignment.described_touches import DescribedTouches
-from touchgoal.encoders.alignment.heads import Heads
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.ssl.frames import check_sensor
@@ -47,19 +45,6 @@ def embed_surfaces(
         objects += [name] * len(presses)
         sentences[name] = surface_sentences(surface)
     return DescribedTouches(np.stack(rows), tuple(objects), sentences)
-
-
-def with_heads(encoder: PooledEncoder, towers: Towers, heads: Heads) -> PooledEncoder:
-    """Return a copy of an encoder with these heads; its touch embeddings stay the same."""
-    own = {
-        "text_dim": towers.text_dim,
-        "text_hidden": heads.text.hidden,
-        "image_dim": towers.image_dim,
-    }
-    worded = PooledEncoder(replace(encoder.config, towers=towers.name, **own))
-    worded.fit(encoder.mean.numpy(), encoder.whitening.numpy())
-    worded.text_map, worded.image_map = heads.text, heads.image
-    return worded.eval().requires_grad_(False)
 
 
 _FINE = 1.5e-3  # m, wavelength: finer texture is roughness, coarser is bumps

@@ -4,8 +4,7 @@ The direction of an embedding describes the surface, wherever and however it is 
 0 to 1, the strength of the contact at the strongest spot of the image.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -93,19 +92,9 @@ class PooledEncoder(BaseTouchEncoder):
         if config.image_dim:
             self.image_map = TowerMap(config.image_dim, config.features)
         self.requires_grad_(False)
-        stages = _Stages(network or load_efficientnet_lite0(), config.last_block)
+        stages = PooledStages(network or load_efficientnet_lite0(), config.last_block)
         self._stages = [stages]  # in a list, so that its weights are not part of the state
         self._compiled = CompiledNetwork(stages)
-
-    @property
-    def device(self) -> torch.device:
-        """Return the device of the weights."""
-        return self.mean.device
-
-    @property
-    def towers(self) -> str | None:
-        """See BaseTouchEncoder."""
-        return self.config.towers
 
     def embed_text_goal(self, texts: list[str], towers: Towers) -> Float32[np.ndarray, "n d"]:
         """See BaseTouchEncoder; unit vectors from the mean of the `rank_sentences` to each sentence.
@@ -125,12 +114,6 @@ class PooledEncoder(BaseTouchEncoder):
         """Map the image tower's embeddings to touch, as unit vectors; only with `image_dim`."""
         return self.image_map(embeddings)
 
-    @property
-    def covariance(self) -> Float[np.ndarray, "d d"]:
-        """Return the covariance of pooled features that the whitening takes out."""
-        whitening = self.whitening.double().numpy()
-        return np.linalg.inv(whitening @ whitening.T)
-
     def fit(
         self, mean: Float[np.ndarray, " d"], whitening: Float[np.ndarray, "d d"]
     ) -> "PooledEncoder":
@@ -138,6 +121,22 @@ class PooledEncoder(BaseTouchEncoder):
         self.mean.copy_(torch.from_numpy(mean))
         self.whitening.copy_(torch.from_numpy(whitening))
         return self
+
+    def with_maps(
+        self, towers: Towers, text: TowerMap, image: TowerMap | None = None
+    ) -> "PooledEncoder":
+        """Return a copy with maps of these towers' sentences and images; it embeds touch as before."""
+        own = {
+            "text_dim": towers.text_dim,
+            "text_hidden": text.hidden,
+            "image_dim": 0 if image is None else towers.image_dim,
+        }
+        worded = PooledEncoder(replace(self.config, towers=towers.name, **own))
+        worded.fit(self.mean.numpy(), self.whitening.numpy())
+        worded.text_map = text
+        if image is not None:
+            worded.image_map = image
+        return worded.eval().requires_grad_(False)
 
     def embed_touch(
         self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
@@ -164,7 +163,7 @@ class PooledEncoder(BaseTouchEncoder):
         return self._stages[0].to(touch.device)(images)
 
 
-class _Stages(nn.Module):
+class PooledStages(nn.Module):
     """An ImageNet network up to a block, pooled stage by stage."""
 
     def __init__(self, network: EfficientNetLite0, last_block: int) -> None:
@@ -172,7 +171,14 @@ class _Stages(nn.Module):
         self.stem, self.blocks = network.stem, nn.ModuleList(list(network.blocks)[: last_block + 1])
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
-        return pool_stages(self.stem, self.blocks, images)
+        """Return means and standard deviations of RGB images (0 to 1) after the `STAGES` within it."""
+        x = self.stem(imagenet_normalised(images).contiguous(memory_format=torch.channels_last))
+        pooled, stages = [], {block for block, _ in STAGES}
+        for i, block in enumerate(self.blocks):
+            x = block(x)
+            if i in stages:
+                pooled += [x.mean((2, 3)), x.std((2, 3))]
+        return torch.cat(pooled, 1)
 
 
 def as_images(touch: Float[Tensor, "n 3 h w"], scale: float) -> Float[Tensor, "n 3 h w"]:
@@ -182,16 +188,3 @@ def as_images(touch: Float[Tensor, "n 3 h w"], scale: float) -> Float[Tensor, "n
         scale: counts of change that are 1.0 in them.
     """
     return (128 + _CONTRAST * scale * touch).clamp(0, 255) / 255
-
-
-def pool_stages(
-    stem: nn.Module, blocks: Iterable[nn.Module], images: Float[Tensor, "n 3 h w"]
-) -> Float[Tensor, "n d"]:
-    """Return means and standard deviations of RGB images (0 to 1) after the `STAGES` within `blocks`."""
-    x = stem(imagenet_normalised(images).contiguous(memory_format=torch.channels_last))
-    pooled, stages = [], {block for block, _ in STAGES}
-    for i, block in enumerate(blocks):
-        x = block(x)
-        if i in stages:
-            pooled += [x.mean((2, 3)), x.std((2, 3))]
-    return torch.cat(pooled, 1)

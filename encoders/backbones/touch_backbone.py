@@ -1,6 +1,7 @@
 """Interface of touch encoders, and the backbone that training without labels makes."""
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 import torch
@@ -69,7 +70,7 @@ class BaseTouchEncoder(nn.Module):
     @property
     def towers(self) -> str | None:
         """Return `Towers.name` of the towers whose sentences it embeds, or None."""
-        return None
+        return getattr(self.config, "towers", None)
 
     def project_text(self, embeddings: Float[Tensor, "n t"]) -> Float[Tensor, "n d"]:
         """Map the text tower's embeddings to touch, as unit vectors."""
@@ -99,7 +100,7 @@ class BaseTouchEncoder(nn.Module):
     @property
     def device(self) -> torch.device:
         """Return the device of the weights."""
-        return next(self.parameters()).device
+        return next(chain(self.parameters(), self.buffers())).device
 
     def embed(
         self, images: np.ndarray, background: np.ndarray | None = None

@@ -1,7 +1,5 @@
 """Adaptation of a whitened encoder to real videos: its centre, its covariance and its sentences."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -40,11 +38,7 @@ def adapt(encoder: PooledEncoder, videos: list[LabelledVideo], towers: Towers) -
         return adapted
     ranks = torch.tensor([videos[i].ranks for i in ranked])
     directions = torch.stack([direction(adapted, pooled[i]) for i in ranked])
-    own = {"text_dim": towers.text_dim, "text_hidden": 0, "image_dim": 0}
-    worded = PooledEncoder(replace(encoder.config, towers=towers.name, **own))
-    worded.fit(adapted.mean.numpy(), adapted.whitening.numpy())
-    worded.text_map = fit_text_head(directions, ranks, towers.embed_texts)
-    return worded
+    return adapted.with_maps(towers, fit_text_head(directions, ranks, towers.embed_texts))
 
 
 def pool_firmest(
@@ -72,12 +66,14 @@ def centre(
     """
     every = torch.cat(pooled).double().numpy()
     names = np.repeat(objects, [len(rows) for rows in pooled])
-    covariance = (1 - _SHARE) * encoder.covariance + _SHARE * within_classes(every, names)
+    before = encoder.whitening.double().numpy()
+    simulated = np.linalg.inv(before @ before.T)  # the covariance that it takes out
+    covariance = (1 - _SHARE) * simulated + _SHARE * within_classes(every, names)
     whitening = inverse_square_root(covariance, 0.0)
     centred = PooledEncoder(encoder.config)
     centred.load_state_dict(encoder.state_dict())
     centred.fit(every.mean(0), whitening)
-    turn = np.linalg.solve(encoder.whitening.double().numpy(), whitening)
+    turn = np.linalg.solve(before, whitening)
     for child in centred.children():
         if isinstance(child, TowerMap):
             child.turn(torch.from_numpy(turn).float())
