@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 
+from benchmarks.bootstrap import percentile_interval
 from benchmarks.options import CORES, BenchmarkOptions
 from benchmarks.papers import open_loop
 from benchmarks.papers.open_loop import OpenLoopErrors, Plan, open_loop_errors
@@ -22,7 +23,6 @@ from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
 from touchgoal.encoders.backbones.sparsh import Method
 from touchgoal.encoders.pretrained import ENCODER_FORMAT
-from touchgoal.encoders.probes.bootstrap import percentile_interval
 from touchgoal.episodes.recording import EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint

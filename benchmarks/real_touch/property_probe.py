@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 
-from touchgoal.encoders.probes.bootstrap import percentile_interval
+from benchmarks.bootstrap import percentile_interval
 from touchgoal.encoders.whitening.covariance import inverse_square_root, within_classes
 from touchgoal.encoders.whitening.text_head import EmbedTexts, fit_text_head, rank_sentences
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.bootstrap import mean_interval
 from benchmarks.papers.reward_quality.measures import Judged
-from touchgoal.encoders.probes.bootstrap import mean_interval
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve

@@ -12,7 +12,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.encoders.probes.bootstrap import mean_interval, percentile_interval
+from benchmarks.bootstrap import mean_interval, percentile_interval
 from touchgoal.rewards.curves import FUSED, Curves
 from touchgoal.rewards.features.embedded import FINGERTIPS, TOUCH, EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.metrics import auc, measure_curve

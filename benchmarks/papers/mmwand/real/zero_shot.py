@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks.bootstrap import mean_interval
 from benchmarks.options import BenchmarkOptions
 from benchmarks.papers.mmwand.grasped_objects import run_grasped_objects
 from benchmarks.papers.mmwand.other_set import run_other_set
 from benchmarks.published_touch.objectfolder_real import read_objectfolder_real, read_touches
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.pretrained import load_encoder
-from touchgoal.encoders.probes.bootstrap import mean_interval
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.format import set_files
 from touchgoal.rewards.report.tables import aligned
