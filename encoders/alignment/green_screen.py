@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from touchgoal.control.sensors.clip import open_clip
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.image_file import read_image
 
 Image = UInt8[np.ndarray, "h w 3"]
 Alpha = Float32[np.ndarray, "h w"]
@@ -24,7 +24,6 @@ _GREEN = 0.45  # least share of green in a screen
 _LEAST_GREEN = 0.05  # least share of an image that a screen takes up
 _SMALLEST = 6  # px: specks below this area are noise
 _SIZE = 224, 224  # rows and columns of a random background
-_IMAGES = (".png", ".jpg", ".jpeg")
 
 
 Shares = Float32[np.ndarray, "2"]  # shares of red and green in a colour
@@ -71,17 +70,6 @@ def replace_background(
     return np.clip(mixed + 0.5, 0, 255).astype(np.uint8)
 
 
-def read_backgrounds(folder: Path) -> list[Image]:
-    """Read all images of a folder; UserError if it has none."""
-    paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in _IMAGES)
-    if not paths:
-        raise UserError(f"no images in {folder}: give a folder of {', '.join(_IMAGES)}")
-    images = [(path, read_image(path)) for path in paths]
-    if bad := [path.name for path, image in images if image is None]:
-        raise UserError(f"{folder}: {', '.join(bad)} cannot be read as an image")
-    return [image for _, image in images if image is not None]
-
-
 def random_background(rng: np.random.Generator) -> Image:
     """Draw a background: coloured clouds of several sizes, and a few edges as of furniture."""
     h, w = _SIZE
@@ -101,7 +89,7 @@ def random_background(rng: np.random.Generator) -> Image:
 def background_changer(backgrounds: str, seed: int) -> Callable[[Image], Image]:
     """Return a function that replaces an image's background by random ones.
 
-    UserError: the folder has no images.
+    UserError: the folder has no images, or one that cannot be read.
 
     Args:
         backgrounds: "screen" leaves it as it is, "generated" draws them, or a folder of images.
@@ -110,7 +98,7 @@ def background_changer(backgrounds: str, seed: int) -> Callable[[Image], Image]:
         return lambda image: image
     rng = np.random.default_rng(seed)
     known: Shares | None = None
-    images = None if backgrounds == "generated" else read_backgrounds(Path(backgrounds))
+    images = None if backgrounds == "generated" else list(open_clip(Path(backgrounds)).frames())
 
     def change(image: Image) -> Image:
         nonlocal known

@@ -88,14 +88,9 @@ class TouchEncoder(BaseTouchEncoder):
         preprocess = preprocessor_for(config.sensor)
         super().__init__(preprocess, config.embedding_dim)
         self.config = config
-        if config.vit is None:
-            self.backbone, width = (
-                EfficientNetBackbone(preprocess.scale),
-                EfficientNetBackbone.width,
-            )
-        else:
-            self.backbone, width = ViT(config.vit), config.vit.width
-        d = config.embedding_dim
+        vit, d = config.vit, config.embedding_dim
+        self.backbone = EfficientNetBackbone(preprocess.scale) if vit is None else ViT(vit)
+        width = EfficientNetBackbone.width if vit is None else vit.width
         self.touch_head = nn.Linear(width, d, bias=False)
         together = config.pretrained_together
         self.image_head = None if together else nn.Linear(config.image_dim, d, bias=False)

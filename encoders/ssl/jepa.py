@@ -62,12 +62,6 @@ class JointEmbeddingPrediction(SelfDistillation):
         self.config = config
         self.predictor = Predictor(backbone.config.vit, config)
 
-    @property
-    def min_context(self) -> int:
-        """Return the least number of patches left as input in each frame: an eighth."""
-        rows, columns = patch_grid(self.backbone.config.vit)
-        return max(rows * columns // 8, 1)
-
     @torch.no_grad()
     def targets(self, images: Float[Tensor, "b c *t h w"]) -> Float[Tensor, "b n d"]:
         """Return the teacher's tokens of all patches, each with mean 0 and variance 1."""
@@ -118,8 +112,9 @@ class IJepa(JointEmbeddingPrediction):
             masks.draw_blocks(grid, size, count, 1, generator), grid[0] * grid[1]
         )
         size = masks.draw_size(grid, _TARGET_SCALE, ASPECT, generator)
+        least = max(grid[0] * grid[1] // 8, 1)  # patches left as input
         target, left = masks.draw_targets(
-            grid, size, count, _TARGET_BLOCKS, context, self.min_context, generator
+            grid, size, count, _TARGET_BLOCKS, context, least, generator
         )
         return {"context_ids": masks.draw_equal_counts(left, generator), "target_ids": target}
 
