@@ -2,11 +2,15 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from pydantic import TypeAdapter
 from pydantic_core import to_json
 
 from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
+
+Kind = TypeVar("Kind")
 
 
 def parse_json(data: bytes) -> Any:
@@ -15,6 +19,17 @@ def parse_json(data: bytes) -> Any:
         return json.loads(data, object_pairs_hook=_unique)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+
+
+def read_json(path: Path, kind: type[Kind], otherwise: str) -> Kind:
+    """Read what `write_json` wrote of a dataclass, or of a dict of them.
+
+    UserError, which says `otherwise`: there is no such file, or it holds something else.
+    """
+    try:
+        return TypeAdapter(kind).validate_json(path.read_bytes())
+    except (OSError, ValueError):
+        raise UserError(otherwise) from None
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -107,7 +107,7 @@ def read_table(table: Path, columns: Iterable[str]) -> list[dict[str, str]]:
             raise UserError(f"{table} lacks the column {missing[0]}")
         rows = list(reader)
     if not rows:
-        raise UserError(f"{table} has no rows: fetch it again")
+        raise UserError(f"{table} has no rows: write or fetch it again")
     return rows
 
 

@@ -10,11 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import TypeAdapter, ValidationError
-
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.json_file import write_json
+from touchgoal.runtime.json_file import read_json, write_json
 
 JUDGED = "judged.json"
 Verdict = Literal["success", "failure", "unsure"]
@@ -45,10 +42,8 @@ def _read_judged(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
     path = episodes.root / JUDGED
     if not path.is_file():
         return found
-    try:
-        return found | TypeAdapter(dict[int, JudgedOutcome]).validate_json(path.read_bytes())
-    except ValidationError:
-        raise UserError(f"{path} is damaged: delete it and judge the set again") from None
+    otherwise = f"{path} is damaged: delete it and judge the set again"
+    return found | read_json(path, dict[int, JudgedOutcome], otherwise)
 
 
 def write_judged(episodes: EpisodeSet, outcomes: Mapping[int, JudgedOutcome]) -> None:

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import TypeAdapter
 
 from touchgoal.control.features import TRUTH_FAILURE, TRUTH_PROGRESS, TRUTH_START
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.json_file import write_json
+from touchgoal.runtime.json_file import read_json, write_json
 
 NORMALIZER = "normalizer.json"
 """Name of the file in an encoder's folder, fitted on the encoder's training episodes."""
@@ -136,9 +135,5 @@ class DistanceNormalizer:
     @classmethod
     def load(cls, path: Path) -> "DistanceNormalizer":
         """Read a file that `save` wrote; UserError: no such file, or another one."""
-        try:
-            return TypeAdapter(cls).validate_json(path.read_bytes())
-        except (OSError, ValueError):
-            raise UserError(
-                f"{path} is no normalizer: make one with touchgoal fit-normalizer"
-            ) from None
+        otherwise = f"{path} is no normalizer: make one with touchgoal fit-normalizer"
+        return read_json(path, cls, otherwise)

@@ -36,12 +36,11 @@ class SuccessfulEnds:
             ends[embedded.PUT_DOWN] = np.array([row is not None for row in down])
             if not ends["held"].all(1).any():  # all hands are empty: what they carried was before
                 felt = [embedded.split_features(e.features)[1] for e in episodes]
-                rows = list(map(carried_row, felt, down))
-                carried = {k: v for k, v in embedded.CARRIED.items() if k in felt[0]}
-                ends |= {
-                    v: np.stack([f[k][i] for f, i in zip(felt, rows, strict=True)])
-                    for k, v in carried.items()
-                }
+                rows = map(carried_row, felt, down)
+                carried = embedded.join_rows(
+                    [embedded.take_rows(f, np.array([i])) for f, i in zip(felt, rows, strict=True)]
+                )
+                ends |= {v: carried[k] for k, v in embedded.CARRIED.items() if k in carried}
         return cls(ends, tuple(e.object for e in episodes), episodes[0].made_with)
 
     def for_trajectory(self, own: embedded.EmbeddedEpisode, what: str) -> embedded.Features:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from touchgoal.encoders.pretrained import DEFAULT_ENCODER
 from touchgoal.episodes.outcomes.judged import Verdict
@@ -23,7 +22,7 @@ from touchgoal.rewards.features.successful_ends import SuccessfulEnds
 from touchgoal.rewards.judging.end_state import end_cost, end_costs
 from touchgoal.rewards.value import Value, fit_value
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.json_file import write_json
+from touchgoal.runtime.json_file import read_json, write_json
 
 FIT_JUDGE = "fit one with touchgoal fit-normalizer --judge"
 SHIPPED_JUDGE = DEFAULT_ENCODER.name
@@ -122,10 +121,7 @@ class Judge:
     @classmethod
     def load(cls, path: Path) -> "Judge":
         """Read what `save` wrote; UserError: no such file, or another one."""
-        try:
-            return TypeAdapter(cls).validate_json(path.read_bytes())
-        except (OSError, ValueError):
-            raise UserError(f"{path} is no judge: {FIT_JUDGE}") from None
+        return read_json(path, cls, f"{path} is no judge: {FIT_JUDGE}")
 
 
 def find_judge(name: str | Path) -> Path:

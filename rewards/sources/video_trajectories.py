@@ -7,7 +7,6 @@ folder of images stands for a video everywhere. `labels.csv` beside them (column
 if known object and task) says how each one ended.
 """
 
-import csv
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.arrays import Images
 from touchgoal.control.sensors.clip import IMAGES, VIDEOS, Clip, in_natural_order, open_clip
 from touchgoal.control.tactile.background import SETTLES_WITHIN
+from touchgoal.episodes.importers.labelled_videos import read_table
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.sources.trajectory import Skipped, Source, Trajectory, frames_per_chunk
@@ -196,14 +196,8 @@ def _backgrounds(
 def _read_labels(folder: Path) -> dict[str, dict[str, MetaValue]]:
     """Return the facts in `labels.csv` by name of the trajectory; {} without the file."""
     path = folder / _LABELS
-    if not path.is_file():
-        return {}
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    if rows and not {"file", "outcome"} <= rows[0].keys():
-        raise UserError(f"{path} needs the columns file and outcome")
     labels: dict[str, dict[str, MetaValue]] = {}
-    for row in rows:
+    for row in read_table(path, ("file", "outcome")) if path.is_file() else ():
         facts = labels[_split_name(Path(row["file"]))[0]] = {
             k: row[k] for k in _FACTS if row.get(k)
         }
