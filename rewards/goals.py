@@ -9,7 +9,7 @@ Without touch, and with towers that were trained together (a CLIP), a sentence i
 import hashlib
 import math
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -353,16 +353,6 @@ def frame_index(spec: OwnFrame, length: int, source: str) -> int:
     if spec.index >= length:
         raise UserError(f"goal '{spec}' lies beyond {source}, whose frames are 0 to {length - 1}")
     return spec.index
-
-
-def check_words(specs: Iterable[GoalSpec], touch_knows_words: bool) -> None:
-    """Raise UserError if a goal is a sentence and the touch encoder was not aligned with texts."""
-    sentences = [spec for spec in specs if isinstance(spec, Sentence)]
-    if sentences and not touch_knows_words:
-        raise UserError(
-            f"goal '{sentences[0]}': this touch encoder was not aligned with texts: leave the goal "
-            "out, or take an encoder of train-encoder align"
-        )
 
 
 def missing_camera(source: str, camera: str, cameras: Sequence[str]) -> str:

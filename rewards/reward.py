@@ -29,10 +29,10 @@ from touchgoal.rewards.goals import (
     GoalSpec,
     Inputs,
     OwnFrame,
+    Sentence,
     TouchArrays,
     assign_goals,
     check_goals,
-    check_words,
     goals_of_script,
     same_episode,
 )
@@ -196,7 +196,12 @@ class Reward:
         assigned = assign_goals(specs, inputs.modalities, together)
         check_goals(assigned, inputs)
         embedder = self.embedder(inputs)
-        check_words(specs, embedder.encoder is None or embedder.knows_words)
+        sentence = next((spec for spec in specs if isinstance(spec, Sentence)), None)
+        if sentence and embedder.encoder is not None and not embedder.knows_words:
+            raise UserError(
+                f"goal '{sentence}': this touch encoder was not aligned with texts: leave the goal "
+                "out, or take an encoder of train-encoder align"
+            )
         if "force" in assigned:
             sensor = SENSORS.get(embedder.made_with.sensor)
             if why_not := "the sensor is unknown" if sensor is None else sensor.images_only:

@@ -22,13 +22,13 @@ from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import (
     GoalImage,
+    Inputs,
     Modality,
     OwnFrame,
-    Sentence,
     assign_goals,
-    check_words,
     parse_goal,
 )
+from touchgoal.rewards.reward import Reward
 from touchgoal.runtime.errors import UserError
 
 ALL: tuple[Modality, ...] = ("image", "tactile", "text")
@@ -100,6 +100,7 @@ def test_encoders_without_words_measure_touch() -> None:
     """Learned without labels, or an ImageNet network: 0 at the goal, as far untouched as can be."""
     torch.manual_seed(0)
     goal = assign_goals([OwnFrame()], ("image", "tactile"))
+    inputs = Inputs.of("mine", recorded().frames, sensor="gelsight_mini")
     for encoder in (
         TouchBackbone(TouchBackboneConfig.for_sensor(PRESETS["tiny"], "gelsight_mini")),
         PooledEncoder(PooledEncoderConfig.for_sensor("gelsight_mini")),
@@ -112,7 +113,7 @@ def test_encoders_without_words_measure_touch() -> None:
         assert cost[0] > 0.02 and np.ptp(cost[:7]) < 1e-6
         assert e.made_with.sensor == "gelsight_mini" and e.made_with.encoder
         with pytest.raises(UserError, match="was not aligned with texts"):
-            check_words([Sentence("hard")], embedder.knows_words)
+            Reward("hard", encoder=encoder, towers=PaintTowers()).prepare(inputs)
 
 
 def test_an_episode_embedded_in_chunks_is_the_whole(embedder: EpisodeEmbedder) -> None:

@@ -50,8 +50,19 @@ class MaskedAutoencoder(nn.Module):
     def forward(
         self, touch: Float16[Tensor, "b *t 3 h w"], ids_keep: Int[Tensor, "b k"]
     ) -> dict[str, Float[Tensor, ""]]:
-        """Return the loss, for the trainer."""
-        return {"loss": self.loss(self.images(touch), ids_keep)}
+        """Return the loss: the mean squared error of the reconstructed patches, in the preprocessor's units.
+
+        With a bottleneck all patches count, otherwise the masked ones. Patches are not normalised
+        to variance 1, as in He et al.: most of a touch is untouched, and would become noise at full
+        size.
+        """
+        images = self.images(touch)
+        actual = patchify(images, self.backbone.config.vit)
+        error = (self.reconstruct(images, ids_keep) - actual) ** 2
+        if self.config.bottleneck:
+            return {"loss": error.mean()}
+        masked = torch.ones(error.shape[:2], device=error.device).scatter(1, ids_keep, 0.0)
+        return {"loss": (error.mean(2) * masked).sum() / masked.sum()}
 
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw the patches that the backbone reads: `ids_keep` (count, k)."""
@@ -62,21 +73,6 @@ class MaskedAutoencoder(nn.Module):
         """Return the backbone's input; of two frames the newer one's channels come first."""
         touch = touch.float()
         return stack_frames(touch, self.backbone.config.vit) if self.config.stacked else touch
-
-    def loss(
-        self, touch: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"]
-    ) -> Float[Tensor, ""]:
-        """Return the mean squared error of the reconstructed patches, in the preprocessor's units.
-
-        With a bottleneck all patches count, otherwise the masked ones. Patches are not normalised
-        to variance 1, as in He et al.: most of a touch is untouched, and would become noise at full
-        size.
-        """
-        error = (self.reconstruct(touch, ids_keep) - patchify(touch, self.backbone.config.vit)) ** 2
-        if self.config.bottleneck:
-            return error.mean()
-        masked = torch.ones(error.shape[:2], device=error.device).scatter(1, ids_keep, 0.0)
-        return (error.mean(2) * masked).sum() / masked.sum()
 
     def reconstruct(
         self, touch: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"]
@@ -116,10 +112,10 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
     generator = torch.Generator().manual_seed(0)
     total, blank = 0.0, 0.0
     for batch in val.touch.split(BATCH):
-        touch = model.images(batch.to(device))
+        touch = batch.to(device)
         ids_keep = model.draw(len(touch), generator)["ids_keep"].to(device)
-        total += model.loss(touch, ids_keep).item() * len(touch)
-        blank += patchify(touch, vit).square().mean().item() * len(touch)
+        total += model(touch, ids_keep)["loss"].item() * len(touch)
+        blank += patchify(model.images(touch), vit).square().mean().item() * len(touch)
     return {
         "validation_loss": total / len(val),
         "validation_loss_of_blank": blank / len(val),
