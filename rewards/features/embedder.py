@@ -249,12 +249,13 @@ class EpisodeEmbedder:
         if alone:  # which may lack what other goals are for
             keys = own.sides if modality == "tactile" else (self.camera, *others)
         ends = self._ends.get((spec, keys))
-        if ends is None and isinstance(spec, GoalFile):
-            ends = SuccessfulEnds.load(spec.path)
-        elif ends is None:
-            read = spec.read(also=keys)
-            ends = SuccessfulEnds.of([self.embed_chunks([e], own.fps, name) for name, e in read])
-        self._ends[spec, keys] = ends
+        if ends is None:
+            if isinstance(spec, GoalFile):
+                ends = SuccessfulEnds.load(spec.path)
+            else:
+                embedded = [self.embed_chunks([e], own.fps, n) for n, e in spec.read(also=keys)]
+                ends = SuccessfulEnds.of(embedded)
+            self._ends[spec, keys] = ends
         return ends.features if alone else ends.for_trajectory(own, str(spec))
 
 
