@@ -21,7 +21,7 @@ from touchgoal.control.deployment.control_loop import (
     Request,
     TickStatus,
 )
-from touchgoal.control.deployment.scripted import start_move
+from touchgoal.control.deployment.scripted import PlannedMove, ScriptedActor, start_move
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor, Cost, CostReading
 from touchgoal.control.run_log import SLOW_ARM, RunLog, slow_arm
@@ -150,7 +150,10 @@ class Session:
         if self.cost is None or not self.execute or not self.cell.task.judge:
             return ending, None
         if ending.reason == PLAN_ENDED or ending.reason.startswith(TIME_UP):
-            held = loop.run(_Still(loop), _HOLD_TIME, log, new=False)
+            still = ScriptedActor(
+                [PlannedMove(None, loop.width, np.inf)], loop.commanded, ft.CONTROL_HZ
+            )
+            held = loop.run(still, _HOLD_TIME, log, new=False)
             if held.reason.startswith(TIME_UP):
                 told = self.cost.judge()
                 if (done := _BY_JUDGE[told.verdict]) is None:
@@ -307,16 +310,6 @@ def report(result: Result, numbers: dict[str, Any], episodes: str) -> str:
     if (told := result.judged) is not None:
         lines.append("the judge says: " + ", ".join([told.verdict, *told.reasons]))
     return "\n".join(lines)
-
-
-class _Still(Actor):
-    """Holds arm and gripper where they are commanded to be."""
-
-    def __init__(self, loop: ControlLoop) -> None:
-        self._action = np.append(np.zeros(len(loop.commanded())), loop.width)
-
-    def act(self, observation: Observation) -> np.ndarray:
-        return self._action
 
 
 class _SuccessWatch:
