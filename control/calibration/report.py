@@ -30,18 +30,19 @@ _GREY, _INK, _PAPER = (150, 150, 150), (40, 40, 40), 255
 
 ImageErrors = dict[str, float]
 """Mean absolute error of the whole image (`l1`, counts); and within REGION contact radii, where the
-press is: `l1_near`, peak signal-to-noise ratio (`psnr_near`, dB), similarity (`ssim_near`, 1 at best)."""
+press is: `l1_near`, peak signal-to-noise ratio (`psnr_near`, dB), SSIM (`ssim_near`, 1 at best)."""
 
 
 def image_errors(measured: Image, simulated: Counts, circle: Circle) -> ImageErrors:
     """Return the errors of an image of a press, simulated without noise and not yet clipped."""
     near = squared_distance(measured.shape, circle) < (press_fit.REGION * circle[2]) ** 2
     truth, image = measured.astype(np.float32), simulated.clip(0, 255)
-    error = np.abs(image - truth)
+    error, similarity = np.abs(image - truth), cv2.quality.QualitySSIM.create(truth)
+    similarity.compute(image)
     return {
         "l1_near": float(error[near].mean()),
         "psnr_near": float(10 * np.log10(255**2 / (error[near] ** 2).mean())),
-        "ssim_near": float(_structural_similarity(truth, image)[near].mean()),
+        "ssim_near": float(np.asarray(similarity.getQualityMap())[near].mean()),
         "l1": float(error.mean()),
     }
 
@@ -49,18 +50,6 @@ def image_errors(measured: Image, simulated: Counts, circle: Circle) -> ImageErr
 def mean_errors(errors: list[ImageErrors]) -> ImageErrors:
     """Return the mean of each error over several images."""
     return {name: float(np.mean([each[name] for each in errors])) for name in errors[0]}
-
-
-def _structural_similarity(a: Counts, b: Counts) -> Counts:
-    """Return SSIM (Wang et al. 2004): Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03."""
-
-    def mean(image: np.ndarray) -> np.ndarray:
-        return cv2.GaussianBlur(image, (11, 11), 1.5)
-
-    c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
-    ma, mb = mean(a), mean(b)
-    va, vb, cov = mean(a * a) - ma * ma, mean(b * b) - mb * mb, mean(a * b) - ma * mb
-    return (2 * ma * mb + c1) * (2 * cov + c2) / ((ma * ma + mb * mb + c1) * (va + vb + c2))
 
 
 def held_out_errors(judged: FittedCalibration, test: PressSet) -> dict[str, ImageErrors]:
