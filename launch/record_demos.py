@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from touchgoal.control.features import CONTROL_HZ
-from touchgoal.control.teleoperation.config import TeleoperationConfig
-from touchgoal.control.teleoperation.device import DeviceName
+from touchgoal.control.teleoperation.device import DeviceName, TeleoperationConfig
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 

@@ -21,7 +21,7 @@ from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop
 from touchgoal.control.interfaces import Actor, DriverError
 from touchgoal.control.run_log import RunLog
-from touchgoal.control.teleoperation.config import TeleoperationConfig
+from touchgoal.control.teleoperation.device import TeleoperationConfig
 from touchgoal.control.teleoperation.teleoperator import Teleoperator
 from touchgoal.launch.support.cell_run import check_cell, confirm
 from touchgoal.runtime.errors import UserError

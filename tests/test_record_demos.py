@@ -24,7 +24,6 @@ from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
-from touchgoal.control.teleoperation.config import TeleoperationConfig
 from touchgoal.control.teleoperation.device import HandMotion, KeyboardDevice, TeleoperationDevice
 from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.spacemouse import SpaceMouse, find_spacemouse
@@ -132,7 +131,7 @@ class Pushed(TeleoperationDevice):
 
 def act(twist: list[float], wrench: tuple[float, ...] = (0.0,) * 6) -> tuple[np.ndarray, ...]:
     """What an action moves (m) and turns (rad, base frame), and the gripper's width."""
-    config = TeleoperationConfig(speed=0.1, turn_speed=0.4)
+    config = record_demos.TeleoperationConfig(speed=0.1, turn_speed=0.4)
     kinematics = Kinematics(FR3.arm, FR3.tool.tcp_offset)
     q = FR3.arm.home
     hand = Teleoperator(Pushed(twist), ActionFilter(FR3, HZ), lambda: q, config)

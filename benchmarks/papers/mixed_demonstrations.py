@@ -14,7 +14,7 @@ from touchgoal.control.deployment.scripted import PickPlacePoses
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.control.teleoperation.config import TeleoperationConfig
+from touchgoal.control.teleoperation.device import TeleoperationConfig
 from touchgoal.control.teleoperation.scripted_device import ScriptedDevice
 from touchgoal.control.teleoperation.teleoperator import Teleoperator
 from touchgoal.episodes.recording import EpisodeSpec, Roles, collect, missing_specs

@@ -5,16 +5,28 @@ A typed key pushes or turns the hand for a moment.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field
 
 from touchgoal.control.features import Observation
+from touchgoal.runtime.option_types import checked_dataclass
 
 DeviceName = Literal["keyboard", "spacemouse", "scripted"]
 GripperRequest = Literal["", "open", "close"]
 Verdict = Literal["", "done", "not done"]
+
+
+@checked_dataclass
+class TeleoperationConfig:
+    """Response of the hand to a device."""
+
+    speed: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    """Speed of the hand at full deflection, m/s; with a keyboard, at any key."""
+    turn_speed: Annotated[float, Field(gt=0, le=2)] = 0.6
+    """Turning speed of the hand at full deflection, rad/s."""
 
 
 @dataclass(frozen=True)

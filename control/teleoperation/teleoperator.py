@@ -13,9 +13,11 @@ from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.control.teleoperation.config import COMPLIANCE, TeleoperationConfig
-from touchgoal.control.teleoperation.device import TeleoperationDevice
+from touchgoal.control.teleoperation.device import TeleoperationConfig, TeleoperationDevice
 
+# Speed per force and turning speed per torque at which the hand yields, m/s per N beyond 3 N and rad/s
+# per Nm beyond 0.3 Nm; much more oscillates.
+COMPLIANCE = 2e-3, 0.5
 _FREE_FORCE = 3.0  # N beyond the first reading that count as none: the weight of a carried object
 
 
