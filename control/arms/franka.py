@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.arms.streaming import ArmClient, shift_wrench
-from touchgoal.control.interfaces import ArmReading, DriverError, Joints
+from touchgoal.control.interfaces import ArmReading, Joints
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Kinematics
 
@@ -37,16 +37,15 @@ class FrankaClient(ArmClient):
         model = self.config.robot
         self._kinematics = Kinematics(model.arm, model.tool.tcp_offset)
         # No real-time kernel is asked for: firmware 5.9 and later does without.
-        self._robot: franky.Robot | None = client.Robot(
+        self._robot: franky.Robot = client.Robot(
             self.config.address,
             default_torque_threshold=_TORQUE_REFLEX,
             default_force_threshold=_FORCE_REFLEX,
             realtime_config=client.RealtimeConfig.Ignore,
         )
-        robot = self._require()
-        if recover and robot.state.robot_mode == client.RobotMode.Reflex:
-            robot.recover_from_errors()
-        return self._limits(robot)
+        if recover and self._robot.state.robot_mode == client.RobotMode.Reflex:
+            self._robot.recover_from_errors()
+        return self._limits(self._robot)
 
     def _limits(self, robot: "franky.Robot") -> JointLimits:
         """Set franky's limits and return the stream's.
@@ -68,7 +67,7 @@ class FrankaClient(ArmClient):
         return JointLimits(interface.lower, interface.upper, *used, taper=interface.taper)
 
     def _measure(self) -> ArmReading:
-        robot = self._require()
+        robot = self._robot
         try:
             robot.poll_motion()  # raises the error that ended a motion
         except self._franky.ControlException as error:
@@ -107,22 +106,16 @@ class FrankaClient(ArmClient):
             np.clip(wanted, -self._ceiling, self._ceiling), self._franky.Duration(_COMMAND_MS)
         )
         try:
-            self._require().move(motion, asynchronous=True)
+            self._robot.move(motion, asynchronous=True)
         except self._franky.ControlException as error:
             self._aborted = " ".join(str(error).split())  # the next measurement says why
 
     def _halt(self) -> None:
-        robot = self._require()
-        if robot.is_in_control:
-            robot.move(self._franky.JointVelocityStopMotion(), asynchronous=True)
+        if self._robot.is_in_control:
+            self._robot.move(self._franky.JointVelocityStopMotion(), asynchronous=True)
 
     def _disconnect(self) -> None:
-        self._robot = None
-
-    def _require(self) -> "franky.Robot":
-        if self._robot is None:
-            raise DriverError("the arm is not connected")
-        return self._robot
+        del self._robot
 
 
 def wrench_on_robot(estimate: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6"]:
