@@ -162,32 +162,25 @@ def lay_out(images: Collection[str], scalars: Collection[str], timeline: str) ->
     import rerun.blueprint as views  # pyright: ignore[reportMissingImports]
 
     names = dict.fromkeys(path.split("/")[0] for path in (*images, *scalars))
-    tabs = [_tab(name, _under(name, images), _under(name, scalars)) for name in names]
+    tabs = [
+        _tab(name, *([p for p in paths if p.startswith(f"{name}/")] for paths in (images, scalars)))
+        for name in names
+    ]
     time = views.TimePanel(timeline=timeline, state="collapsed")
     return views.Blueprint(views.Tabs(*tabs), time, collapse_panels=True)
-
-
-def _under(name: str, paths: Collection[str]) -> list[str]:
-    return [path for path in paths if path.startswith(f"{name}/")]
 
 
 def _tab(name: str, images: list[str], scalars: list[str]) -> Any:
     import rerun.blueprint as views  # pyright: ignore[reportMissingImports]
 
+    shown = [views.Spatial2DView(origin=_entity(p), name=p.rpartition("/")[2]) for p in images]
     # pairs from the end: the fingertips come last, and stand side by side
-    ends = range(len(images), 0, -2)
-    rows = [views.Horizontal(*map(_image, images[max(0, end - 2) : end])) for end in ends]
+    rows = [views.Horizontal(*shown[max(0, end - 2) : end]) for end in range(len(shown), 0, -2)]
     plots: dict[str, list[str]] = {}
     for path in scalars:
         plots.setdefault(path.rpartition("/")[0], []).append(path)
     curves = views.Vertical(*(_plot(plot, paths) for plot, paths in plots.items()))
     return views.Horizontal(views.Vertical(*reversed(rows)), curves, name=name)
-
-
-def _image(path: str) -> Any:
-    import rerun.blueprint as views  # pyright: ignore[reportMissingImports]
-
-    return views.Spatial2DView(origin=_entity(path), name=path.rpartition("/")[2])
 
 
 def _plot(plot: str, curves: list[str]) -> Any:
