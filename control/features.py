@@ -85,58 +85,53 @@ def features_of(joints: int) -> dict[str, Feature]:
     return {
         STATE: Feature("float32", (2 * joints + 1,), (*moving, "gripper.pos"), state),
         COMMAND: Feature("float32", (2 * joints,), moving, command),
-        **_BEFORE_ACTION,
+        TCP_POSE: Feature("float32", (7,), _POSE, "tool centre point in the base frame: m, wxyz"),
+        WRENCH: Feature(
+            "float32", (6,), _WRENCH, "external force (N) and torque (Nm) at the TCP, base frame"
+        ),
+        LOAD: Feature(
+            "float32", (1,), ("fz",), "force on the table's load cell, N; where there is one"
+        ),
+        AGE: Feature("float32", (1,), ("age",), "age of its oldest measurement, s"),
+        FRONT: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "fixed camera facing the robot, RGB"),
+        WRIST: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "camera on the hand, RGB"),
+        **{
+            key: Feature(
+                "uint8", (224, 224, 3), _IMAGE_NAMES, "camera of the touch wand's bench, RGB"
+            )
+            for key in WAND_VIEWS
+        },
+        TACTILE_LEFT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "left fingertip sensor, RGB"),
+        TACTILE_RIGHT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "right fingertip sensor, RGB"),
         ACTION: Feature("float32", (joints + 1,), targets, action),
-        **_AFTER_ACTION,
+        COST: Feature(
+            "float32",
+            (1,),
+            ("cost",),
+            "distance to the goal as measured in the run: 1 at the usual start, 0 at the usual end",
+        ),
+        TRUTH_PAD_WRENCH: Feature(
+            "float32",
+            (12,),
+            tuple(f"{side}.{n}" for side in ("left", "right") for n in _WRENCH),
+            "force (N) and torque (Nm) of the object on each pad, pad frame (z out of the gel)",
+        ),
+        TRUTH_CONTACT: Feature("bool", (2,), ("left", "right"), "pad touches something"),
+        TRUTH_SLIP: Feature("bool", (2,), ("left", "right"), "pad contact slides"),
+        TRUTH_OBJECT_POSE: Feature("float32", (7,), _POSE, "object in the base frame: m, wxyz"),
+        TRUTH_START: Feature(
+            "float32",
+            (7,),
+            ("x", "y", "z", "cos_2yaw", "sin_2yaw", "goal.x", "goal.y"),
+            "as the episode begins, base frame: the object (m), the hand's yaw to grasp it, the goal "
+            "(m); twice the yaw, as half a turn changes nothing between two fingers",
+        ),
+        TRUTH_PROGRESS: Feature("float32", (1,), ("progress",), "task progress in [0, 1]"),
+        TRUTH_SUCCESS: Feature("bool", (1,), ("success",), "task done"),
+        TRUTH_FAILURE: Feature(
+            "bool", (3,), ("drop", "jam", "over_force"), "object lost, stuck, pressed too hard"
+        ),
     }
 
-
-_BEFORE_ACTION = {
-    TCP_POSE: Feature("float32", (7,), _POSE, "tool centre point in the base frame: m, wxyz"),
-    WRENCH: Feature(
-        "float32", (6,), _WRENCH, "external force (N) and torque (Nm) at the TCP, base frame"
-    ),
-    LOAD: Feature(
-        "float32", (1,), ("fz",), "force on the table's load cell, N; where there is one"
-    ),
-    AGE: Feature("float32", (1,), ("age",), "age of its oldest measurement, s"),
-    FRONT: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "fixed camera facing the robot, RGB"),
-    WRIST: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "camera on the hand, RGB"),
-    **{
-        key: Feature("uint8", (224, 224, 3), _IMAGE_NAMES, "camera of the touch wand's bench, RGB")
-        for key in WAND_VIEWS
-    },
-    TACTILE_LEFT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "left fingertip sensor, RGB"),
-    TACTILE_RIGHT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "right fingertip sensor, RGB"),
-}
-_AFTER_ACTION = {
-    COST: Feature(
-        "float32",
-        (1,),
-        ("cost",),
-        "distance to the goal as measured in the run: 1 at the usual start, 0 at the usual end",
-    ),
-    TRUTH_PAD_WRENCH: Feature(
-        "float32",
-        (12,),
-        tuple(f"{side}.{n}" for side in ("left", "right") for n in _WRENCH),
-        "force (N) and torque (Nm) of the object on each pad, pad frame (z out of the gel)",
-    ),
-    TRUTH_CONTACT: Feature("bool", (2,), ("left", "right"), "pad touches something"),
-    TRUTH_SLIP: Feature("bool", (2,), ("left", "right"), "pad contact slides"),
-    TRUTH_OBJECT_POSE: Feature("float32", (7,), _POSE, "object in the base frame: m, wxyz"),
-    TRUTH_START: Feature(
-        "float32",
-        (7,),
-        ("x", "y", "z", "cos_2yaw", "sin_2yaw", "goal.x", "goal.y"),
-        "as the episode begins, base frame: the object (m), the hand's yaw to grasp it, the goal "
-        "(m); twice the yaw, as half a turn changes nothing between two fingers",
-    ),
-    TRUTH_PROGRESS: Feature("float32", (1,), ("progress",), "task progress in [0, 1]"),
-    TRUTH_SUCCESS: Feature("bool", (1,), ("success",), "task done"),
-    TRUTH_FAILURE: Feature(
-        "bool", (3,), ("drop", "jam", "over_force"), "object lost, stuck, pressed too hard"
-    ),
-}
 
 FEATURES = features_of(N_JOINTS)
