@@ -259,7 +259,7 @@ def test_five_answers_missed_in_a_row_lose_the_robotiq(line: tuple[int, str]) ->
 
 def test_a_load_cell_whose_controller_restarts_is_heard_again_and_one_old_line_is_not() -> None:
     cell = SerialLoadCell.__new__(SerialLoadCell)
-    cell._clock, cell._last, cell._behind = -np.inf, -np.inf, 0
+    cell.clock, cell._last, cell._behind = -np.inf, -np.inf, 0
     taken = [
         cell._clock_advances(Sample(0.0, float(t))) for t in [*range(100, 120), 50, 120, 121, 121]
     ]

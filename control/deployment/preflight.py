@@ -13,7 +13,7 @@ from touchgoal.control.arms.client_libraries import FRANKY, UR_RTDE, ClientLibra
 from touchgoal.control.arms.driver_process import error_line
 from touchgoal.control.arrays import Image
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.control.cell.connection import CellConnection
+from touchgoal.control.cell.connection import CellConnection, camera_formats
 from touchgoal.control.deployment.hand import require_empty_hand
 from touchgoal.control.interfaces import Camera, TactileSensor
 from touchgoal.control.motion.kinematics import Kinematics
@@ -72,13 +72,11 @@ def preflight(
         ("ceilings", lambda: _ceilings(cell, safety)),
         ("gripper", lambda: _gripper(cell, connection)),
     ]
-    nominal = {ft.IMAGE_PREFIX + name: camera.rate for name, camera in cell.cameras.items()}
-    if tips := cell.fingertips:
-        nominal |= dict.fromkeys(ft.TACTILE, tips.rate or find_sensor(cell.sensor).frame_rate)
+    formats = camera_formats(cell)
     for key, camera in connection.cameras.items():
-        check = partial(_camera, camera, rates[key], nominal[key], tips_seen.get(key, []))
+        check = partial(_camera, camera, rates[key], formats[key][0], tips_seen.get(key, []))
         checks.append((key.removeprefix(ft.IMAGE_PREFIX), check))
-    if tips:
+    if cell.fingertips:
         checks.append(("fingertips", lambda: _fingertips(connection)))
     if connection.load_cell:
         checks.append(("load cell", lambda: _load_cell(connection)))

@@ -88,12 +88,15 @@ def with_checksum(text: bytes, checksum: Checksum) -> bytes:
 
 
 class SerialLoadCell:
-    """The LoadCell interface over a serial port; wrong lines are counted and skipped."""
+    """The LoadCell interface over a serial port; wrong lines are counted and skipped.
+
+    `clock` is the device's of the latest line; minus infinity without one.
+    """
 
     def __init__(self, config: LoadCellConfig) -> None:
         self.config = config
         self._port = open_port(config.port, config.baud, timeout=0.2)
-        self._buffer, self._clock, self._rejected = b"", -math.inf, 0
+        self._buffer, self.clock, self._rejected = b"", -math.inf, 0
         self._last, self._behind = -math.inf, 0  # clock of the last line; lines behind the newest
         self._at_line_start = False  # whether the buffer starts at a line's start
         self._latest = LatestValue(f"load cell {config.port}", self._take)
@@ -101,11 +104,6 @@ class SerialLoadCell:
     def read(self) -> LoadReading:
         """See LoadCell."""
         return self._latest.read()
-
-    @property
-    def clock(self) -> float:
-        """Device clock of the latest line; minus infinity without one."""
-        return self._clock
 
     def close(self) -> None:
         """See LoadCell."""
@@ -133,10 +131,10 @@ class SerialLoadCell:
         """Return whether the device's clock has advanced, if it has one."""
         if sample.clock is None:
             return True
-        before, last, self._last = self._clock, self._last, sample.clock
+        before, last, self._last = self.clock, self._last, sample.clock
         # A clock that rises, but is behind its latest value: the microcontroller has restarted.
         self._behind = self._behind + 1 if last < sample.clock <= before else 0
         if self._behind >= _RESTARTED:
-            before = self._clock = last
-        self._clock = max(self._clock, sample.clock)
+            before = self.clock = last
+        self.clock = max(self.clock, sample.clock)
         return sample.clock > before

@@ -38,15 +38,10 @@ class TactileCamera:
     """
 
     def __init__(self, camera: Camera, model: SensorModel, crop: Crop) -> None:
-        self._camera, self._model, self._crop = camera, model, crop
+        self._camera, self.model, self._crop = camera, model, crop
         self._raw: Frame | None = None
         self._whole: Frame | None = None
         self._torn = ""
-
-    @property
-    def model(self) -> SensorModel:
-        """See TactileSensor."""
-        return self._model
 
     @property
     def problem(self) -> str:
@@ -57,13 +52,13 @@ class TactileCamera:
         """See Camera; UserError if the image's proportions are not the sensor's."""
         raw = self._camera.read()
         if self._raw is not raw:
-            frame = replace(raw, image=crop_to_sensor(raw.image, self._model, self._crop))
+            frame = replace(raw, image=crop_to_sensor(raw.image, self.model, self._crop))
             before = self._whole.image if self._whole else None
             self._raw, self._torn = raw, find_seam(frame.image, before)
             if not self._torn:
                 self._whole = frame
         if self._whole is None:
-            raise DriverError(f"the image of the {self._model.name}: {self._torn}")
+            raise DriverError(f"the image of the {self.model.name}: {self._torn}")
         return self._whole
 
     def close(self) -> None:
