@@ -1,8 +1,8 @@
 """One deployment: start move, task, recorded episode, report."""
 
 import time
-from collections.abc import Callable
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -105,23 +105,20 @@ class Session:
         # Scripts end by themselves; for other actors only a simulator knows when the task is done.
         scripted = self.cell.task.policy == "expert"
         truth = None if scripted else self._truth
-        watch = _SuccessWatch(truth, self.cell.time_waits)
         log = RunLog(self.recorder.add) if self.execute else RunLog()
-        loop = ControlLoop(
-            self.connection,
-            self.safety,
-            self.execute,
-            lambda: self.operator_request() or watch.request(),
-            self.on_tick,
-            self.cost,
-            self.camera_size,
-        )
-        try:
+        with _success_requests(truth, self.cell.time_waits) as success_request:
+            loop = ControlLoop(
+                self.connection,
+                self.safety,
+                self.execute,
+                lambda: self.operator_request() or success_request(),
+                self.on_tick,
+                self.cost,
+                self.camera_size,
+            )
             ending = self._move_to_start(loop)
             if ending is None:
                 ending = loop.run(self.make_actor(loop), self.cell.task.seconds, log)
-        finally:
-            watch.close()
         picked = self.execute and scripted and ending.reason == PLAN_ENDED
         if picked and self._held_width() is None:  # it ends with the object in the hand
             ending = Ending(f"{PLAN_ENDED}, but the hand holds nothing", done=False)
@@ -312,29 +309,23 @@ def report(result: Result, numbers: dict[str, Any], episodes: str) -> str:
     return "\n".join(lines)
 
 
-class _SuccessWatch:
-    """Ends a run once the simulator, if there is one, says that the task is done.
+@contextmanager
+def _success_requests(truth: Truth | None, time_waits: bool) -> Iterator[Callable[[], Request]]:
+    """Yield what requests a run's end once the simulator, if there is one, says that the task is done.
 
     It is asked in every tick if the simulated time waits for it, else in a thread.
     """
 
-    def __init__(self, truth: Truth | None, time_waits: bool) -> None:
-        self._truth = truth
-        threaded = truth is not None and not time_waits
-        self._thread = LatestValue("simulator", self._ask_now_and_then) if threaded else None
-        if self._thread:
-            self._thread.read()  # waits for the first answer, so that no tick does
+    def ask() -> Request:
+        return "success" if truth and truth()["success"] else ""
 
-    def request(self) -> Request:
-        return self._thread.read() if self._thread else self._ask()
-
-    def close(self) -> None:
-        if self._thread:
-            self._thread.close()
-
-    def _ask(self) -> Request:
-        return "success" if self._truth and self._truth()["success"] else ""
-
-    def _ask_now_and_then(self) -> Request:
+    def ask_now_and_then() -> Request:
         time.sleep(_ASK_INTERVAL)
-        return self._ask()
+        return ask()
+
+    if truth is None or time_waits:
+        yield ask
+        return
+    with closing(LatestValue("simulator", ask_now_and_then)) as answers:
+        answers.read()  # waits for the first answer, so that no tick does
+        yield answers.read
