@@ -35,10 +35,8 @@ _MIN_RATE_SHARE = 0.8  # share of the camera rate that the cell file states
 # grasp makes 20 and more; real units differ by more than simulated ones (unmeasured here).
 _TOUCHED_COUNTS = 12.0
 _WATCH_SECONDS = 1.0  # s for which cameras are watched, again and again while an exposure settles
-_SETTLED, _SETTLES_WITHIN = (
-    0.03,
-    10.0,
-)  # change of a channel's light in that time, a share; s, at most
+_SETTLED = 0.03  # share by which a channel's light may change in that time
+_SETTLES_WITHIN = 10.0  # s, at most
 # mm between tools by nominal and by the controller's kinematics: a UR's own calibration makes 1 to 2
 _CALIBRATED, _OTHER_ARM = 1.0, 10.0
 _WATCH_INTERVAL = 0.05  # s between two looks at the fingertips

@@ -193,10 +193,8 @@ class _Estimate:
         own = self.lens
         lens = np.array(astuple(own)) + change[:6] * [own.fx, own.fy, own.fx, own.fy, 1.0, 1.0]
         camera = self.camera @ _transform(change[6:12])
-        board, scale = (
-            self.board @ _transform(change[12:18]),
-            self.scale * float(np.exp(change[18])),
-        )
+        board = self.board @ _transform(change[12:18])
+        scale = self.scale * float(np.exp(change[18]))
         return _Estimate(Lens(*lens.tolist()), camera, board, scale)
 
     def board_seen(self, motions: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:

@@ -80,13 +80,8 @@ class SelfDistance:
         ends = np.array([point for capsule in body for point in (capsule.start, capsule.end)])
         frames = [capsule.frame for capsule in body for _ in range(2)]
         self._ends = Kinematics(arm, 0.0).points_on_links(ends, frames)
-        pairs = [
-            (i, j)
-            for i, a in enumerate(body)
-            for j, b in enumerate(body)
-            if b.frame - a.frame >= _NEIGHBOURS
-        ]
-        self._first, self._second = np.array(pairs).T
+        part = np.array([capsule.frame for capsule in body])
+        self._first, self._second = np.nonzero(part - part[:, None] >= _NEIGHBOURS)
         radius = np.array([capsule.radius for capsule in body])
         self._radii = radius[self._first] + radius[self._second]
 

@@ -14,9 +14,8 @@ _SPARE = 2.5
 # Threshold (counts) above which light touches are missed: JPEG of quality 50 has 7 to 9, of 70 at most
 # 5.4, 60 clips of a real Mini (PhysiCLeAR) 2.3 to 6.7.
 _COARSE = 7.0
-_NO_NOISE = (
-    30.0  # counts: a threshold above it comes of a touch in the first frames, not of compression
-)
+# Counts: a threshold above it comes of a touch in the first frames, not of compression.
+_NO_NOISE = 30.0
 _LEARNING_FRAMES = 10  # 0.4 s of a 25 Hz sensor
 _FEWEST_FRAMES = 3  # of these that differ
 _LEARNING_QUANTILE = 0.3

@@ -148,17 +148,8 @@ GELSIGHT_WEDGE = replace(
     measured=False,
 )
 
-SENSORS = {
-    sensor.name: sensor
-    for sensor in (
-        GELSIGHT_MINI,
-        GELSIGHT_MINI_MARKERS,
-        GELSIGHT,
-        GELSIGHT_MARKERS,
-        DIGIT,
-        GELSIGHT_WEDGE,
-    )
-}
+_ALL = GELSIGHT_MINI, GELSIGHT_MINI_MARKERS, GELSIGHT, GELSIGHT_MARKERS, DIGIT, GELSIGHT_WEDGE
+SENSORS = {sensor.name: sensor for sensor in _ALL}
 
 
 def find_model(name: str) -> SensorModel:

@@ -14,14 +14,8 @@ from touchgoal.runtime.errors import UserError
 
 _FAINTEST = 0.5  # share of the usual darkness; a fainter spot is no dot
 _LEAST_FOUND = 0.7  # share of the grid's dots that a marker gel must show
-_SCALES = (
-    1.0,
-    1.25,
-    0.8,
-    1.55,
-    0.65,
-    1.95,
-)  # of another gel's or crop's grid, against the sensor's
+# Of another gel's or crop's grid, against the sensor's.
+_SCALES = (1.0, 1.25, 0.8, 1.55, 0.65, 1.95)
 _FEWEST, _SPAN = 12, 0.5  # dots of another grid; share of the image's width and height it covers
 _TURN = np.radians(35)  # of a grid, at most
 _CROOKED = 0.15  # of its spacing: usual distance from a straight lattice, above which it is none
