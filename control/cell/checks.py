@@ -131,13 +131,8 @@ def _check_task(cell: CellConfig) -> None:
             f"task.start must be {_JOINTS[cell.arm]} joint positions of the {cell.arm} in rad, "
             f"not {len(task.start)}"
         )
-    if (
-        task.simulated == "pick-place"
-        and task.wires
-        or task.simulated == "bead-maze"
-        and task.objects
-    ):
-        other = "wires" if task.wires else "objects"
+    other = "wires" if task.simulated == "pick-place" else "objects"
+    if getattr(task, other):
         raise UserError(f"task.{other} does nothing in {task.simulated}: leave it out")
     if task.own:
         _check_own_task(task)

@@ -24,12 +24,7 @@ def read_config(path: Path, kind: type[Config], name: str) -> Config:
         table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except OSError as error:
         raise UserError(f"cannot read the {name} {path}: {error.strerror}") from error
-    except (
-        tomllib.TOMLDecodeError,
-        json.JSONDecodeError,
-        UnicodeDecodeError,
-        RecursionError,
-    ) as error:
+    except (ValueError, RecursionError) as error:  # in the text, or in its encoding
         form = "JSON" if path.suffix == ".json" else "TOML"
         raise UserError(f"{path} is no {form}: {error}") from error
     _check_texts(path, table)
