@@ -42,7 +42,10 @@ def open_run(out: Path | None, command: str, config: Any, adds: bool = False) ->
     """
     folder = out or _dated_folder(command)
     check_writable(folder)
-    _hold(folder)
+    if (key := folder.resolve()) not in _held or not key.exists():  # commands of a process share it
+        _held[key] = FolderLock(
+            folder, "another command is writing into {}: wait for it or name another --out"
+        )
     record = {
         "name": command,
         "config": json.loads(json.dumps(asdict(config), default=str)),
@@ -62,14 +65,6 @@ def release_runs() -> None:
     """Release the folders of this process's runs."""
     while _held:
         _held.popitem()[1].release()
-
-
-def _hold(folder: Path) -> None:
-    """Lock the folder against other processes; commands of the same process may share it."""
-    if (key := folder.resolve()) not in _held or not key.exists():
-        _held[key] = FolderLock(
-            folder, "another command is writing into {}: wait for it or name another --out"
-        )
 
 
 def _dated_folder(command: str) -> Path:

@@ -4,7 +4,6 @@ import av
 import numpy as np
 from av.error import FFmpegError
 from av.video.reformatter import VideoReformatter
-from jaxtyping import Bool
 
 from touchgoal.control.arrays import Image
 
@@ -55,7 +54,8 @@ class FrozenParts:
         if before is None or before.shape != image.shape:
             self._changed_at[:] = now
             return now
-        changed = _differs(image, before)
+        rows = (image[::_STRIDE, ::_STRIDE] != before[::_STRIDE, ::_STRIDE]).any(axis=(1, 2))
+        changed = np.array([band.any() for band in np.array_split(rows, _BANDS)])
         self._changed_at[changed] = now
         if self._seen < _LEARNING:
             self._seen += 1
@@ -64,9 +64,3 @@ class FrozenParts:
         if self._seen < _LEARNING or not watched.any():
             return float(self._changed_at.max())  # all of it must stand still
         return float(self._changed_at[watched].min())
-
-
-def _differs(image: Image, before: Image) -> Bool[np.ndarray, " bands"]:
-    a, b = image[::_STRIDE, ::_STRIDE], before[::_STRIDE, ::_STRIDE]
-    rows = (a != b).any(axis=(1, 2))
-    return np.array([band.any() for band in np.array_split(rows, _BANDS)])

@@ -42,7 +42,9 @@ def deform(
     h, w = overlap.shape
     scale = pixels_per_cell(pitch)
     low = cv2.resize(overlap, (w // scale, h // scale), interpolation=cv2.INTER_AREA)
-    contact = _contact(low)
+    around = 2 * NEARBY_CELLS + 1
+    nearby = cv2.dilate(low, np.ones((around, around), np.uint8))
+    contact = (low > CONTACT_SHARE * nearby).view(np.uint8)  # 1 where the gel touches the object
     smooth = low
     for sigma in blur_sigmas:
         smooth = cv2.GaussianBlur(smooth, (0, 0), sigma / (pitch * scale))
@@ -54,13 +56,6 @@ def deform(
     )
     surface = smooth + soft * (overlap - low)
     return surface if textured else cv2.GaussianBlur(surface, (3, 3), 0)
-
-
-def _contact(overlap: Map) -> UInt8[np.ndarray, "h w"]:
-    """Return 1 where the gel touches the object, 0 elsewhere."""
-    around = 2 * NEARBY_CELLS + 1
-    nearby = cv2.dilate(overlap, np.ones((around, around), np.uint8))
-    return (overlap > CONTACT_SHARE * nearby).view(np.uint8)
 
 
 def shadow_depth(

@@ -219,18 +219,10 @@ def _array(value: Any) -> Float32[np.ndarray, "..."]:
     return array
 
 
-def _numbers(value: Any) -> tuple[float, ...]:
-    return tuple(float(v) for v in _array(value))
-
-
 def _positive(value: Any) -> float:
     if not (value > 0 and math.isfinite(value)):
         raise ValueError(f"must be positive, not {value}")
     return float(value)
-
-
-def _number(value: Any) -> float:
-    return float(value) if math.isfinite(value) else math.nan
 
 
 def _plain(value: Any) -> Any:
@@ -245,14 +237,14 @@ _NUMBERS: dict[str, Callable[[Any], Any]] = {
     "sensor": str,
     "pixel_pitch": _positive,
     "response": _array,
-    "light_azimuths": _numbers,
+    "light_azimuths": lambda value: tuple(map(float, _array(value))),
     "shadow_slope": _positive,
     "shadow": _array,
     "penumbra": _positive,
     "max_slope": _positive,
     "max_depth": _positive,
-    "blur_sigmas": _numbers,
-    "noise": _number,
+    "blur_sigmas": lambda value: tuple(map(float, _array(value))),
+    "noise": lambda value: float(value) if math.isfinite(value) else math.nan,
     "illumination_exponent": _positive,
 }
 _INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # lists of numbers go on one line
