@@ -14,7 +14,6 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
@@ -177,8 +176,29 @@ def _unguarded_script() -> str:
 def _map_on_ray(
     function: Callable[[Item], Result], items: Sequence[Item], address: str
 ) -> Results[Result]:
-    with ray_cluster(address) as cluster:
-        yield from _in_order(cluster.task(function), cluster.result, items, cluster.cores)
+    """Map on a cluster, whose number of cores changes as nodes come and go.
+
+    Ray retries after deaths, and computes a result again if it is lost with its node.
+    """
+    with _connected(address) as ray:
+        sent = ray.put(function)  # is sent once per node, not once per item
+        task = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
+
+        def result(reference: Any) -> Result:
+            try:
+                return reference.future().result()  # `ray.get` takes SIGTERM for Ctrl-C
+            except ray.exceptions.RayTaskError as error:
+                raise error.cause from error
+            except ray.exceptions.RayError as error:
+                reason = str(error).strip().splitlines()[0]
+                raise UserError(
+                    f"the cluster lost an item {RETRIES + 1} times: {reason}"
+                ) from error
+
+        def cores() -> int:
+            return int(ray.cluster_resources().get("CPU", 1))
+
+        yield from _in_order(partial(task.remote, sent), result, items, cores)
 
 
 def _in_order(
@@ -200,39 +220,9 @@ def _in_order(
 RETRIES = 3  # times that an item is computed again after its worker or its node died
 
 
-@dataclass(frozen=True)
-class RayCluster:
-    """A cluster that this process is connected to; `ray` is the module."""
-
-    ray: Any
-
-    def cores(self) -> int:
-        """Return the number of cores, which changes as nodes come and go."""
-        return int(self.ray.cluster_resources().get("CPU", 1))
-
-    def task(self, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """Return what submits an item and returns the reference of its result.
-
-        Ray retries after deaths, and computes a result again if it is lost with its node.
-        """
-        sent = self.ray.put(function)  # is sent once per node, not once per item
-        task = self.ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
-        return lambda item: task.remote(sent, item)
-
-    def result(self, reference: Any) -> Any:
-        """Wait for a result; raise what the function raised, UserError if its workers died."""
-        try:
-            return reference.future().result()  # `ray.get` takes SIGTERM for Ctrl-C
-        except self.ray.exceptions.RayTaskError as error:
-            raise error.cause from error
-        except self.ray.exceptions.RayError as error:
-            reason = str(error).strip().splitlines()[0]
-            raise UserError(f"the cluster lost an item {RETRIES + 1} times: {reason}") from error
-
-
 @contextmanager
-def ray_cluster(address: str) -> Iterator[RayCluster]:
-    """Connect to a cluster; at the end unfinished work of this process is dropped.
+def _connected(address: str) -> Iterator[Any]:
+    """Connect to a cluster and yield the module ray; at the end unfinished work of this process is dropped.
 
     UserError: Ray is not installed, or no cluster answers.
     """
@@ -250,7 +240,7 @@ def ray_cluster(address: str) -> Iterator[RayCluster]:
         ) from error
     signal.signal(signal.SIGTERM, on_sigterm)  # Ray's would end this process without a word
     try:
-        yield RayCluster(ray)
+        yield ray
     finally:
         ray.shutdown()
 
