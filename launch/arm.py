@@ -7,6 +7,7 @@ not read, so gels are not watched. Exit status: 0 done, 1 nothing moved, 4 the a
 
 import sys
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -36,11 +37,12 @@ class Config:
 def main(config: Config) -> None:
     """Connect, ask, act, report."""
     from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
-    from touchgoal.control.deployment.manual import without_images
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.launch.support.cell_run import confirm
 
-    cell = without_images(read_cell_file(find_cell_file(config.cell)))
+    cell = read_cell_file(find_cell_file(config.cell))
+    # A broken camera or fingertip must not keep the arm in place.
+    cell = replace(cell, cameras={}, fingertips=None)
     if cell.arm == "sim":
         raise UserError(
             "a simulated arm ends with its command: give a real arm's cell file or a twin's"
@@ -68,7 +70,7 @@ def _move(move: str, cell: "CellConfig") -> None:
     import numpy as np
 
     from touchgoal.control.deployment.control_loop import PLAN_ENDED
-    from touchgoal.control.deployment.manual import ManualControl, home_pose
+    from touchgoal.control.deployment.manual import ManualControl
     from touchgoal.control.deployment.terminal import HELP, Terminal
     from touchgoal.launch.support.cell_run import connect
 
@@ -78,7 +80,9 @@ def _move(move: str, cell: "CellConfig") -> None:
             print(f"MOVING: {HELP}", flush=True)
             control = ManualControl(cell, connection, terminal.operator_request, terminal.show_tick)
             if move == "home":
-                ending = control.move_arm(home_pose(cell, connection.robot.arm))
+                start = cell.task.start
+                home = connection.robot.arm.home if start is None else np.array(start)
+                ending = control.move_arm(home)
             else:
                 ending = control.move_hand(opened=move == "open")
         arm, hand = connection.arm.read(), connection.gripper.read()

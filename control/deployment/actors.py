@@ -38,7 +38,10 @@ def make_actor(
     truth: Callable[[], dict[str, Any]] | None,
     commanded: Callable[[], np.ndarray],
 ) -> Actor:
-    """Return the actor for one run, from where the arm is now; without a policy the cell's script."""
+    """Return the actor for one run, from where the arm is now; without a policy the cell's script.
+
+    The expert's grasp and goal are the cell file's, else the simulator's.
+    """
     if policy is not None:
         # Waiting makes a run on a simulated arm repeatable on any machine.
         timeout = _SIMULATED_PLAN_TIMEOUT if cell.time_waits else None
@@ -47,17 +50,12 @@ def make_actor(
         return RealTimeActor(policy, timeout, ServoLag(safety.limits, safety.dt))
     if cell.task.policy == "follower":
         return WireFollower(ft.CONTROL_HZ)
-    return pick_and_place(_pick_place_poses(cell, truth), safety, commanded)
-
-
-def _pick_place_poses(
-    cell: CellConfig, truth: Callable[[], dict[str, Any]] | None
-) -> PickPlacePoses:
-    """Return the expert's grasp and goal from the cell file, else from the simulator."""
-    task = cell.task
-    if task.grasp and task.goal:
-        return PickPlacePoses(task.grasp, task.goal)
-    if truth is None:
-        raise UserError("task.grasp and task.goal are missing: measure where they are, in metres")
-    layout = truth()["layout"]
-    return PickPlacePoses(tuple(layout["grasp"]), tuple(layout["goal"]))
+    grasp, goal = cell.task.grasp, cell.task.goal
+    if not (grasp and goal):
+        if truth is None:
+            raise UserError(
+                "task.grasp and task.goal are missing: measure where they are, in metres"
+            )
+        layout = truth()["layout"]
+        grasp, goal = tuple(layout["grasp"]), tuple(layout["goal"])
+    return pick_and_place(PickPlacePoses(grasp, goal), safety, commanded)

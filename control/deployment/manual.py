@@ -1,7 +1,7 @@
 """Moves without a task: the arm to a posture, the hand open or closed."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,23 +12,12 @@ from touchgoal.control.cell.limits import cell_watchdogs
 from touchgoal.control.deployment.control_loop import ControlLoop, Ending, Request, TickStatus
 from touchgoal.control.deployment.scripted import PlannedMove, ScriptedActor, start_move
 from touchgoal.control.interfaces import Joints
-from touchgoal.control.motion.arm_models import ArmModel
 from touchgoal.control.run_log import RunLog
 from touchgoal.control.safety.action_filter import ActionFilter
 
 _TIMEOUT = 60.0  # s for a move
 _STILL_SECONDS = 1.0  # s for which a hand must stand still to have arrived
 _THERE = 1e-3  # rad; an arm this near a posture need not move to it
-
-
-def without_images(cell: CellConfig) -> CellConfig:
-    """Return the cell without cameras and fingertips: a broken one must not keep the arm in place."""
-    return replace(cell, cameras={}, fingertips=None)
-
-
-def home_pose(cell: CellConfig, arm: ArmModel) -> Joints:
-    """Return the cell's `task.start` (rad), else the arm model's home."""
-    return arm.home if cell.task.start is None else np.array(cell.task.start)
 
 
 @dataclass(frozen=True)
