@@ -15,10 +15,9 @@ from jaxtyping import Float, Float32
 from touchgoal.control import features as ft
 from touchgoal.control.arrays import Image
 from touchgoal.control.features import Observation
+from touchgoal.control.motion.arm_models import Joints
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
-
-Joints = Float[np.ndarray, "n"]
 
 STOPPED_ON_REQUEST = "stopped on request"
 """Prefix of the fault message of an arm that was stopped on request."""

@@ -48,8 +48,7 @@ def cell_limits(cell: CellConfig) -> RobotLimits:
 def cell_watchdogs(cell: CellConfig) -> Watchdogs:
     """Return the deadlines with the cell's own ages."""
     own = cell.safety
-    return replace(
-        Watchdogs(),
+    return Watchdogs(
         observation=Deadline(own.observation_age, _STOP_FACTOR * own.observation_age),
         state=Deadline(own.state_age, _STOP_FACTOR * own.state_age),
     )

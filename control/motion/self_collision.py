@@ -7,10 +7,10 @@ from jaxtyping import Float
 
 from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM, ArmModel
 from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.motion.tool import Point
 from touchgoal.control.motion.trajectories import Trajectory
 from touchgoal.runtime.errors import UserError
 
-Point = tuple[float, float, float]
 Points = Float[np.ndarray, "*k 3"]
 
 

@@ -13,10 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-from touchgoal.control.motion.arm_models import JointLimits
+from touchgoal.control.motion.arm_models import JointLimits, Joints
 from touchgoal.control.safety.limits import RobotLimits
-
-Joints = Float[np.ndarray, "n"]
 
 SERVO_DAMPING = 0.1  # s: damping over stiffness, as in Franka's fr3.xml
 _RESERVE = 1.1  # factor on the targets' pace by which the reference may catch up

@@ -12,11 +12,11 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Bool, Float
 
+from touchgoal.control.motion.arm_models import Joints
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import RobotLimits, braked_velocity, max_stoppable_speed
 from touchgoal.runtime.errors import UserError
 
-Joints = Float[np.ndarray, "n"]
 Allows = Callable[[Joints, Float[np.ndarray, "c n"]], Bool[np.ndarray, " c"]]
 
 

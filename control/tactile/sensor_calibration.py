@@ -203,10 +203,8 @@ def load(folder: Path) -> SensorCalibration:
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{path} has no usable {name} ({error}): {_MAKE}") from error
     lights = len(values["light_azimuths"])
-    for name, shape in {
-        "response": (3, N_FEATURES, PLACES[version]),
-        "shadow": (3, lights),
-    }.items():
+    shapes = {"response": (3, N_FEATURES, PLACES[version]), "shadow": (3, lights)}
+    for name, shape in shapes.items():
         if values[name].shape != shape:
             raise UserError(f"{path}: {name} is {values[name].shape}, not {shape}: {_MAKE}")
     return SensorCalibration(background=image, **values)
