@@ -12,7 +12,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import PickPlaceConfig, PickPlaceReset, with_options
-from touchgoal.sim_envs.scene.build import VISUAL_GROUP
+from touchgoal.sim_envs.scene.build import NO_CONTACT, VISUAL_GROUP
 from touchgoal.sim_envs.scene.objects import CATALOGUE, find_object, sample_body
 
 Hand = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, " j"]]
@@ -128,9 +128,8 @@ class PickPlace(FrankaTactileEnv):
             size=[0.03, 0.0005, 0],
             pos=[*self.goal, 0.0005],
             rgba=[0.1, 0.55, 0.35, 1],
-            contype=0,
-            conaffinity=0,
             group=VISUAL_GROUP,
+            **NO_CONTACT,
         )
 
     def place_objects(self, rng: np.random.Generator) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from touchgoal.control.motion.tool import FRANKA_HAND, SENSOR_BELOW_CARRIAGE, Tool
 from touchgoal.control.motion.tracker import SERVO_DAMPING
@@ -20,6 +21,8 @@ from touchgoal.sim_envs.scene.variety import place_camera
 
 SIDES = ("left", "right")
 OBJECT_GROUP, VISUAL_GROUP, HIDDEN_GROUP = 1, 2, 3
+NO_CONTACT = {"contype": 0, "conaffinity": 0}
+"""Options of a geom that meets nothing."""
 GRIPPER_MAX_FORCE = 80.0  # N, both fingers; opening never needs a limit below it
 
 _UR5E = Path(__file__).with_name("ur5e.xml")
@@ -138,7 +141,7 @@ def add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
     length, width, depth = sensor.case_size
     protrusion = sensor.gel_thickness + 0.0005  # the case must never take the load
     grey, black = [0.3, 0.3, 0.32, 1], [0.12, 0.12, 0.13, 1]
-    visual = {"contype": 0, "conaffinity": 0, "mass": 0.0, "group": VISUAL_GROUP, "rgba": grey}
+    visual = {"mass": 0.0, "group": VISUAL_GROUP, "rgba": grey, **NO_CONTACT}
     # Adapter (GelSight's STEP file): mount block 21 x 25 mm on the carriage, arm 30 x 12 mm.
     finger.add_geom(type=box, size=[0.0105, 0.0125, 0.010], pos=[0, 0.014, 0.010], **visual)
     arm = (z - length / 2 - 0.018) / 2
@@ -154,10 +157,8 @@ def add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
         rgba=black,
     )
     # Sensor frame: x down the finger, z out of the gel (towards the other finger), y = z x x.
-    x, y, out = np.array([0.0, 0, 1]), np.array([-1.0, 0, 0]), np.array([0, -1.0, 0])
-    finger.add_site(
-        name=f"{side}_sensor", pos=[0, 0, z], quat=_quaternion(x, y, out), group=HIDDEN_GROUP
-    )
+    axes = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    finger.add_site(name=f"{side}_sensor", pos=[0, 0, z], quat=quaternion(axes), group=HIDDEN_GROUP)
     _add_gel(spec, finger, side, sensor, z)
 
 
@@ -264,19 +265,14 @@ def _add_cameras_and_table(spec: mujoco.MjSpec, tool: Tool) -> None:
         size=[3, 3, 0.1],
         pos=[0, 0, -0.4],
         rgba=[0.35, 0.38, 0.42, 1],
-        contype=0,
-        conaffinity=0,
         group=VISUAL_GROUP,
+        **NO_CONTACT,
     )
 
 
-_GEOM_TYPES = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "mesh": mujoco.mjtGeom.mjGEOM_MESH,
-}
+def geom_type(shape: str) -> mujoco.mjtGeom:
+    """Return MuJoCo's number of a shape of `objects.SHAPES`."""
+    return getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}")
 
 
 def add_body(spec: mujoco.MjSpec, body: Body) -> None:
@@ -296,7 +292,7 @@ def add_body(spec: mujoco.MjSpec, body: Body) -> None:
     soft = kind.material.foundation_modulus < FIRM
     item.add_geom(
         name=body.name,
-        type=_GEOM_TYPES[kind.shape],
+        type=geom_type(kind.shape),
         mass=body.mass,
         rgba=kind.material.rgba,
         group=OBJECT_GROUP,
@@ -310,17 +306,18 @@ def add_body(spec: mujoco.MjSpec, body: Body) -> None:
     )
 
 
-def _quaternion(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[float]:
-    """Return the quaternion (wxyz) of a frame with axes x, y, z in the parent frame."""
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.stack([x, y, z], axis=1).ravel())
-    return quat.tolist()
+def quaternion(R: np.ndarray) -> Float[np.ndarray, "4"]:
+    """Return the quaternion (wxyz) of a rotation, (3, 3) or its 9 numbers by rows."""
+    mujoco.mju_mat2Quat(quat := np.empty(4), np.ravel(R))
+    return quat
 
 
-def look_at(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> list[float]:
+def look_at(
+    eye: Sequence[float], target: Sequence[float], up: Sequence[float]
+) -> Float[np.ndarray, "4"]:
     """Return the orientation (wxyz) of a camera at `eye` that looks at `target`, `up` upwards."""
     z = np.subtract(eye, target)
     z = z / np.linalg.norm(z)
     x = np.cross(up, z)
     x = x / np.linalg.norm(x)
-    return _quaternion(x, np.cross(z, x), z)
+    return quaternion(np.stack([x, np.cross(z, x), z], axis=1))

@@ -1,12 +1,12 @@
 """Objects to grasp: shapes, materials, and the catalogue of both."""
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -100,20 +100,24 @@ class Body:
         return self.size[0]
 
 
+def read_material(entry: Mapping[str, Any]) -> Material:
+    """Return the material of a catalogue's entry, which is in um, mm and Pa/m (or hard, firm, soft)."""
+    return Material(
+        Texture[entry["texture"].upper()],
+        entry.get("amplitude", 0.0) * 1e-6,
+        entry.get("wavelength", 1.0) * 1e-3,
+        {"hard": HARD, "firm": FIRM, "soft": SOFT}.get(entry["stiffness"]) or entry["stiffness"],
+        entry["friction"],
+        (*entry["rgb"], entry.get("opacity", 1.0)),
+    )
+
+
 def _read_kinds(file: str) -> dict[str, ObjectKind]:
     entries = tomllib.loads(Path(__file__).with_name(file).read_text())
-    kinds = {}
-    for name, entry in entries.items():
-        material = Material(
-            Texture[entry["texture"].upper()],
-            entry.get("amplitude", 0.0) * 1e-6,
-            entry.get("wavelength", 1.0) * 1e-3,
-            {"hard": HARD, "firm": FIRM, "soft": SOFT}[entry["stiffness"]],
-            entry["friction"],
-            (*entry["rgb"], 1.0),
-        )
-        kinds[name] = ObjectKind(name, entry["shape"], material, tuple(entry["descriptions"]))
-    return kinds
+    return {
+        name: ObjectKind(name, e["shape"], read_material(e), tuple(e["descriptions"]))
+        for name, e in entries.items()
+    }
 
 
 CATALOGUE = _read_kinds("objects.toml")

@@ -139,8 +139,7 @@ def add_texture(
     """
     if not material.is_textured:
         return
-    scalars = -2 * material.amplitude, pitch
-    below, step = (np.float32(a) for a in scalars)
+    below, step = np.float32(-2 * material.amplitude), np.float32(pitch)
     amplitude, frequency = np.float32(material.amplitude), np.float32(1 / material.wavelength)
     place, turn = (np.asarray(a, np.float32) for a in (position, rotation))
     if material.texture > Texture.WOVEN:

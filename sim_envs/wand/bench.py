@@ -9,7 +9,15 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from touchgoal.sim_envs.scene.build import HIDDEN_GROUP, OBJECT_GROUP, VISUAL_GROUP, look_at
+from touchgoal.sim_envs.scene.build import (
+    HIDDEN_GROUP,
+    NO_CONTACT,
+    OBJECT_GROUP,
+    VISUAL_GROUP,
+    geom_type,
+    look_at,
+    quaternion,
+)
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture
 from touchgoal.sim_envs.wand.objects import Mesh, Part, WandObject
 
@@ -78,9 +86,7 @@ class Bench:
     def place_wand(self, tip: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"]) -> None:
         """Put the gel's middle at `tip` (m); `axes` is the sensor frame, z out of the gel."""
         self.data.mocap_pos[self._wand] = tip
-        quat = np.empty(4)
-        mujoco.mju_mat2Quat(quat, np.ascontiguousarray(axes).ravel())
-        self.data.mocap_quat[self._wand] = quat
+        self.data.mocap_quat[self._wand] = quaternion(axes)
         mujoco.mj_forward(self.model, self.data)
 
     def surface_along(
@@ -136,8 +142,7 @@ def _bench_body(spec: mujoco.MjSpec) -> Body:
             group=group,
             rgba=_MATERIAL.rgba,
             friction=[_MATERIAL.friction, 0.005, 0.0001],
-            contype=0,
-            conaffinity=0,
+            **NO_CONTACT,
         )
     return body
 
@@ -155,8 +160,7 @@ def _add_screen(spec: mujoco.MjSpec) -> None:
             pos=place,
             rgba=[*GREEN, 1],
             group=VISUAL_GROUP,
-            contype=0,
-            conaffinity=0,
+            **NO_CONTACT,
         )
     for name, eye in _EYES.items():
         up = (0, 1, 0) if name == "top" else (0, 0, 1)
@@ -167,20 +171,17 @@ def _add_screen(spec: mujoco.MjSpec) -> None:
 
 def _add_part(spec: mujoco.MjSpec, holder: mujoco.MjsBody, name: str, part: Part) -> Body:
     """Add a part twice: as the gel feels it, and coarser as cameras see it."""
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, part.rotation.ravel())
-    item = holder.add_body(name=name, pos=part.position.tolist(), quat=quat.tolist())
+    item = holder.add_body(name=name, pos=part.position, quat=quaternion(part.rotation))
     for group, mesh in ((OBJECT_GROUP, part.mesh), (VISUAL_GROUP, part.coarse)):
         shape: dict = (
             {"size": [*part.size, 0, 0][:3]} if mesh is None else {"meshname": _mesh(spec, mesh)}
         )
         item.add_geom(
-            type=getattr(mujoco.mjtGeom, f"mjGEOM_{part.shape.upper()}"),
+            type=geom_type(part.shape),
             material=_paint(spec, part),
             group=group,
             friction=[part.material.friction, 0.005, 0.0001],
-            contype=0,
-            conaffinity=0,
+            **NO_CONTACT,
             **shape,
         )
     return Body(ObjectKind(name, "mesh", part.material, ()), part.size, 1.0, name)
@@ -246,8 +247,7 @@ def _add_wand(spec: mujoco.MjSpec) -> None:
             pos=[0, 0, z],
             rgba=rgba,
             group=VISUAL_GROUP,
-            contype=0,
-            conaffinity=0,
+            **NO_CONTACT,
         )
     eye = (-0.055, 0.0, -0.075)
     wand.add_camera(name="wand", pos=eye, quat=look_at(eye, (0, 0, 0.005), (0, 0, -1)), fovy=70)

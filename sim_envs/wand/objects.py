@@ -17,7 +17,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from touchgoal.runtime.errors import unknown_name
-from touchgoal.sim_envs.scene.objects import Material, Texture
+from touchgoal.sim_envs.scene.objects import Material, read_material
 
 Mesh = tuple[Float32[np.ndarray, "_ 3"], Int32[np.ndarray, "_ 3"]]
 
@@ -181,20 +181,12 @@ def _part(entry: dict[str, Any]) -> Part:
         mesh = coarse = prism(entry["sides"], *size)
     elif shape not in _PRIMITIVES:
         raise ValueError(f"unknown shape {shape!r}")
-    material = Material(
-        Texture[entry["texture"].upper()],
-        entry.get("amplitude", 0.0) * 1e-6,
-        entry.get("wavelength", 1.0) * 1e-3,
-        entry["stiffness"],
-        entry["friction"],
-        (*entry["rgb"], entry.get("opacity", 1.0)),
-    )
     return Part(
         shape=shape if mesh is None else "mesh",
         size=size if mesh is None else (),
         position=np.array(entry.get("at", (0, 0, 0))) * 1e-3,
         rotation=Rotation.from_euler("xyz", entry.get("turn", (0, 0, 0)), degrees=True).as_matrix(),
-        material=material,
+        material=read_material(entry),
         look=entry.get("look", "plain"),
         second_rgb=tuple(entry.get("rgb2", entry["rgb"])),
         mesh=mesh,

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.tactile.sensor_models import SensorModel
-from touchgoal.sim_envs.scene.build import add_body
+from touchgoal.sim_envs.scene.build import add_body, quaternion
 from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.scene.objects import Body
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
@@ -36,10 +36,8 @@ class PressBench:
         """Put the body at a pose in the sensor's frame, m."""
         site = self._data.site("left_sensor")
         R = site.xmat.reshape(3, 3)
-        pose = np.empty(7)
-        pose[:3] = site.xpos + R @ position
-        mujoco.mju_mat2Quat(pose[3:], (R if rotation is None else R @ rotation).ravel())
-        self._data.joint(self._name).qpos = pose
+        turned = R if rotation is None else R @ rotation
+        self._data.joint(self._name).qpos = [*(site.xpos + R @ position), *quaternion(turned)]
         mujoco.mj_forward(self._model, self._data)
 
     def sense(
