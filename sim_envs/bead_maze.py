@@ -54,6 +54,8 @@ class BeadMaze(FrankaTactileEnv):
     config: BeadMazeConfig
     default_config = BeadMazeConfig()
     disturbance_rotation = 20.0  # rad per m of disturbance: the hole turns with the hand
+    start_width = 2 * (BEAD_RADIUS + 0.004)  # just wide enough to stay off the wire
+    settle_seconds = 0.1
 
     @property
     def grasping(self) -> bool:
@@ -104,7 +106,8 @@ class BeadMaze(FrankaTactileEnv):
         add_bead_on_wire(spec, self.wire, self._friction)
 
     def place_objects(self, rng: np.random.Generator) -> None:
-        """Put the bead at the start of the wire."""
+        """Put the bead at the start of the wire, in its fixture."""
+        self.data.eq_active[self.model.equality("fixture").id] = 1
         self.arc_length = START
         self.failure = np.zeros(3, bool)
         self._furthest, self._stalled_ticks = START, 0
@@ -122,13 +125,6 @@ class BeadMaze(FrankaTactileEnv):
         # the hand's yaw; wires head into the half plane y > 0, or nearly so
         guess[-1] -= (np.arctan2(tangent[1], tangent[0]) + np.pi / 2) % (2 * np.pi) - np.pi / 2
         return self.kinematics.solve_ik(point + offset, R, guess)
-
-    def _let_settle(self) -> None:
-        """Open the hand around the bead, just wide enough to stay off the wire."""
-        self._finger_target = BEAD_RADIUS + 0.004
-        self.data.qpos[self._fingers] = self._finger_target
-        self.data.eq_active[self.model.equality("fixture").id] = 1
-        self._run_tick(np.zeros(self.n_joints), 2 * self._finger_target, seconds=0.1)
 
     def _disturbance(self) -> Float[np.ndarray, " n"]:
         return np.zeros(self.n_joints) if self.grasping else super()._disturbance()

@@ -32,9 +32,6 @@ _DROP = 0.012  # m of sliding along the pads after which the rod is lost
 _MAX_TILT = np.radians(12)
 _LEVEL_TILT, _LEVEL_HEIGHT, _STILL_SPEED = np.radians(3), 1.5e-3, 0.01  # rad, m, m/s
 _CRUSH_TICKS = 2  # successive control ticks above the crush force that break the rod
-# m of each finger from the rod at first: it closes over the first five frames, which show the
-# fingertips untouched, as their background
-_OPENING = 0.016
 _TUG_SECONDS = 0.3
 _HOLD_FORCE = 1.0, 8.0  # N of each finger that just holds the rod, drawn log-uniformly
 _CRUSH_RATIO = 2.5  # force of a finger that crushes the rod, relative to the one that just holds it
@@ -69,6 +66,10 @@ class FragileCarry(FrankaTactileEnv):
     task = "fragile-carry"
     config: FragileCarryConfig
     default_config = FragileCarryConfig()
+    # The hand closes over the first five frames, which show the fingertips untouched, as their
+    # background.
+    start_width = 2 * (RADIUS + 0.016)
+    settle_seconds = 0.1
 
     def instruction(self) -> str:
         """Return the episode's task in words."""
@@ -127,12 +128,6 @@ class FragileCarry(FrankaTactileEnv):
         aside = np.append(rng.uniform(-0.001, 0.001, 2), 0.0)
         place = np.array([START[0] + GRIP_OFFSET, START[1], LEVEL + GRIP_HEIGHT])
         return self.kinematics.solve_ik(place + aside, fingers_down(0.0), self.robot.arm.home)
-
-    def _let_settle(self) -> None:
-        """Open the hand around the rod."""
-        self._finger_target = RADIUS + _OPENING
-        self.data.qpos[self._fingers] = self._finger_target
-        self._run_tick(np.zeros(self.n_joints), 2 * self._finger_target, seconds=0.1)
 
     def begin_tick(self) -> None:
         """Tug at the rod on its way, by half a sine wave."""

@@ -3,23 +3,15 @@
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import (
-    BeadMazeConfig,
-    FragileCarryConfig,
-    Outcome,
-    PickPlaceConfig,
-    TaskConfig,
-)
+from touchgoal.sim_envs.config import EnvConfig, Outcome, TaskConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.experts.fragile_carry import FragileCarryExpert
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.fragile_carry import FragileCarry
 from touchgoal.sim_envs.pick_place import PickPlace
 
-ENVIRONMENTS: dict[type[TaskConfig], type[PickPlace | BeadMaze | FragileCarry]] = {
-    PickPlaceConfig: PickPlace,
-    BeadMazeConfig: BeadMaze,
-    FragileCarryConfig: FragileCarry,
+ENVIRONMENTS: dict[type[EnvConfig], type[PickPlace | BeadMaze | FragileCarry]] = {
+    type(task.default_config): task for task in (PickPlace, BeadMaze, FragileCarry)
 }
 
 

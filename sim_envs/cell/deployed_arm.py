@@ -130,7 +130,6 @@ class DeployedArm:
         hardware: SimulatedHardware,
         start: Joints,
         deployment: DeploymentConfig,
-        monitor_force: Callable[[float], bool],
         rng: np.random.Generator,
     ) -> None:
         """Draw the delays of an episode.
@@ -139,12 +138,10 @@ class DeployedArm:
             hardware: arm, hand and sensors.
             start: commanded joints at first, rad.
             deployment: a resolved config.
-            monitor_force: takes the seconds since its last call, and tells whether the force on the
-                hand is too high.
             rng: draws delays and errors.
         """
         assert deployment.plan_ticks is not None
-        self._hardware, self._monitor_force = hardware, monitor_force
+        self._hardware = hardware
         hz = hardware.config.control_hz
         self._tick_ms = round(1000 / hz)
         if deployment.tracker:
@@ -200,7 +197,7 @@ class DeployedArm:
             self._ms += 1
             self._measure(self._ms in reads, self._ms in shots)
             if self._ms % _FORCE_PERIOD == 0:
-                too_high = self._monitor_force(_FORCE_PERIOD * _DT)
+                too_high = hardware.monitor_force(_FORCE_PERIOD * _DT)
         hardware.update_contacts()
         return self._drive.command
 

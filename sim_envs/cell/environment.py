@@ -15,7 +15,6 @@ from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.deployed_arm import DeployedArm
 from touchgoal.sim_envs.cell.deployment import IDEAL_DEPLOYMENT
-from touchgoal.sim_envs.cell.estimated_wrench import ForceMonitor
 from touchgoal.sim_envs.cell.hardware import SimulatedHardware
 from touchgoal.sim_envs.config import (
     SETPOINT_PERIOD,
@@ -82,6 +81,8 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
 
     task: str  # its name in commands and episodes
     disturbance_rotation = 2.0  # rad of disturbance per m
+    start_width: float | None = None  # m, of the hand at first; None: as wide as it opens
+    settle_seconds = 0.3  # s in which objects come to rest before the first observation
     metadata = {"render_modes": ["rgb_array"], "render_fps": ft.CONTROL_HZ}  # noqa: RUF012
     default_config: EnvConfig = EnvConfig()
 
@@ -92,7 +93,8 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError(f"render_mode is 'rgb_array' or none, not {render_mode!r}")
         config = with_options(config or self.default_config, options)
-        super().__init__(config)
+        forces = TASK_FORCES.get(self.task)
+        super().__init__(config, forces.force_ceiling if forces else np.inf)
         self.render_mode = render_mode
         step = self.robot.hardware.velocity / config.control_hz
         self.action_space = self._limits = gym.spaces.Box(
@@ -101,8 +103,6 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
             dtype=np.float32,
         )
         self.observation_space = self._observation_space()
-        forces = TASK_FORCES.get(self.task)
-        self._force = ForceMonitor(forces.force_ceiling if forces else np.inf)
 
     def _observation_space(self) -> gym.spaces.Dict:
         features, config = ft.features_of(self.n_joints), self.config
@@ -148,7 +148,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         self.place_objects(rng)
         self.command = self._command_before = self.start_joints(rng)
         self._disturbance_state = np.zeros(6)
-        self._finger_target = self.robot.tool.stroke[1] / 2
+        self._finger_target = (self.start_width or self.robot.tool.stroke[1]) / 2
         self.data.qpos[self.arm_positions] = self.command
         self.data.qpos[self._fingers] = self._finger_target
         self._force.reset()
@@ -254,7 +254,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
 
     def _let_settle(self) -> None:
         """Run physics until objects rest, with the hand open, before the first observation."""
-        self._run_tick(np.zeros(self.n_joints), self.robot.tool.stroke[1], seconds=0.3)
+        self._run_tick(np.zeros(self.n_joints), 2 * self._finger_target, self.settle_seconds)
 
     def _disturbance(self) -> Float[np.ndarray, " n"]:
         """Draw a joint change (rad): a random walk of the hand's velocity."""
@@ -282,11 +282,6 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
                 break
         self.update_contacts()
 
-    def monitor_force(self, seconds: float) -> bool:
-        """Update the force monitor `seconds` after the last call; return whether it trips."""
-        self._force.update(self.contact_force(), seconds)
-        return self._force.exceeded
-
     def _begin_episode(self) -> None:
         """Start the episode's clock, its force monitor and, as deployed, its `DeployedArm`."""
         self._ticks = 0
@@ -295,9 +290,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         deployment = self.config.resolved_deployment()
         if deployment != IDEAL_DEPLOYMENT:
             rng = self.np_random.spawn(1)[0]
-            self._deployed = DeployedArm(
-                self, self.command.copy(), deployment, self.monitor_force, rng
-            )
+            self._deployed = DeployedArm(self, self.command.copy(), deployment, rng)
 
     def _observe(self) -> Observation:
         velocity = (self.command - self._command_before) * self.config.control_hz

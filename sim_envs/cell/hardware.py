@@ -11,8 +11,9 @@ from touchgoal.control.features import Observation
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.sim_envs.cell.estimated_wrench import ForceMonitor
 from touchgoal.sim_envs.config import EnvConfig, SceneConfig
-from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
+from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build, quaternion
 from touchgoal.sim_envs.scene.contacts import ContactReader, PadContact
 from touchgoal.sim_envs.scene.lighting import UsualLight
 from touchgoal.sim_envs.scene.objects import Body
@@ -32,8 +33,9 @@ _LEAST_TORQUE = 2.0  # Nm; 20 N on the hand over the table, from any side, load 
 class SimulatedHardware(ABC):
     """Physics and sensors of the cell, a physics step at a time."""
 
-    def __init__(self, config: EnvConfig) -> None:
-        self.config = config
+    def __init__(self, config: EnvConfig, force_ceiling: float) -> None:
+        """`force_ceiling`: N on the hand."""
+        self.config, self._force = config, ForceMonitor(force_ceiling)
         self.sensor = find_sensor(config.sensor)
         self.robot = ROBOTS[config.arm]
         self.n_joints = self.robot.arm.home.size
@@ -123,6 +125,11 @@ class SimulatedHardware(ABC):
             return _NO_FORCE
         return self._reader.external_force(self.data)
 
+    def monitor_force(self, seconds: float) -> bool:
+        """Update the force monitor `seconds` after the last call; return whether it trips."""
+        self._force.update(self.contact_force(), seconds)
+        return self._force.exceeded
+
     def pad_contacts(self) -> tuple[PadContact, PadContact]:
         """Return the exact wrench and slip of both pads at the last `update_contacts`."""
         return self._contacts
@@ -148,11 +155,11 @@ class SimulatedHardware(ABC):
     def read_proprioception(self) -> Observation:
         """Return state, TCP pose and wrench without delay; `update_contacts` first."""
         data = self.data
-        quat = np.zeros(4)
-        mujoco.mju_mat2Quat(quat, data.site_xmat[self._tcp])
         values = {
             ft.STATE: np.concatenate([*self.joints(), [self.width()]]),
-            ft.TCP_POSE: np.concatenate([data.site_xpos[self._tcp], quat]),
+            ft.TCP_POSE: np.concatenate(
+                [data.site_xpos[self._tcp], quaternion(data.site_xmat[self._tcp])]
+            ),
             ft.WRENCH: self._external,
         }
         return {key: value.astype(np.float32) for key, value in values.items()}
