@@ -4,12 +4,15 @@ It advances only while the control loop waits, no faster than the clock: a run r
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control import interfaces
+from touchgoal.control.arrays import Image
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.cell.limits import cell_limits
@@ -136,8 +139,10 @@ class _Gripper:
 class _Camera:
     """Camera interface of the cell; an image is rendered when it is read."""
 
-    def __init__(self, cell: SimulatedCell, name: str, rate: float) -> None:
-        self._cell, self._name, self.rate, self.problem = cell, name, rate, ""
+    problem = ""
+
+    def __init__(self, cell: SimulatedCell, rate: float, take: Callable[[], Image]) -> None:
+        self._cell, self.rate, self._take = cell, rate, take
         self._frame: interfaces.Frame | None = None
 
     def read(self) -> interfaces.Frame:
@@ -150,19 +155,13 @@ class _Camera:
     def close(self) -> None:
         pass
 
-    def _take(self) -> np.ndarray:
-        return self._cell.env.render_camera(self._name)
-
 
 class _TactileCamera(_Camera):
     """TactileSensor interface of the cell."""
 
     def __init__(self, cell: SimulatedCell, side: int, model: SensorModel) -> None:
-        super().__init__(cell, ft.TACTILE[side], model.frame_rate)
-        self._side, self.model = side, model
-
-    def _take(self) -> np.ndarray:
-        return self._cell.env.read_tactile(self._side).image
+        super().__init__(cell, model.frame_rate, lambda: cell.env.read_tactile(side).image)
+        self.model = model
 
 
 class _LoadCell:
@@ -181,11 +180,11 @@ class _LoadCell:
 def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
     """Connect to a simulated cell: sensors, task and limits of a cell file with `arm = "sim"`."""
     env = make_env(replace(env_config_of(config), camera_size=STREAM_SIZE))
-    cell = SimulatedCell(env, config.task.seed, wrench_error=True)
+    cell = SimulatedCell(env, config.task.seed)
     env.update_contacts()
     arm = _Arm(cell, hz)
     cameras: dict[str, interfaces.Camera] = {
-        ft.IMAGE_PREFIX + name: _Camera(cell, name, camera.rate)
+        ft.IMAGE_PREFIX + name: _Camera(cell, camera.rate, partial(env.render_camera, name))
         for name, camera in config.cameras.items()
     }
     if config.fingertips:

@@ -57,7 +57,7 @@ class SimulatedCell:
     without the servo's lag, or torque controlled, without friction, as a Franka's torque loop is.
     """
 
-    def __init__(self, env: FrankaTactileEnv, seed: int, wrench_error: bool = False) -> None:
+    def __init__(self, env: FrankaTactileEnv, seed: int, wrench_error: bool = True) -> None:
         self.env, self._errs = env, wrench_error
         self.reset(seed)
 
@@ -116,7 +116,7 @@ class SimulatedCell:
 
     def give_way(self) -> None:
         """Stop here, as hard as a reflex does, and then give way to what presses."""
-        self._enter_control_mode(torque=False)
+        self.brake(np.full_like(self.dq, _REFLEX_DECELERATION))
         self.q_d, self.dq_d, self._yielding = self.q.copy(), self.dq.copy(), True
 
     def command_gripper(self, width: float, speed: float, force: float) -> None:
@@ -151,11 +151,8 @@ class SimulatedCell:
             env.begin_tick()
         if self._braking is not None:
             self.dq_d = braked_velocity(self.dq_d, self._braking, DT)
-            self.q_d = self.q_d + DT * self.dq_d
-        if self._yielding:
-            deceleration = np.full_like(self.dq_d, _REFLEX_DECELERATION)
-            self.dq_d = braked_velocity(self.dq_d, deceleration, DT)
-            self.q_d = self.q_d + DT * self.dq_d + (DT / _YIELD_TIME) * (self.q - self.q_d)
+            given_way = (DT / _YIELD_TIME) * (self.q - self.q_d) if self._yielding else 0.0
+            self.q_d = self.q_d + DT * self.dq_d + given_way
         pushed = self._apply_nudge()
         env.grasp_force = self.gripper_command.force
         if self._torque is not None:
@@ -239,10 +236,11 @@ class SimulatedCell:
 
     def _note_extremes(self) -> None:
         limits, worst = self.env.robot.hardware, self.worst
-        excess, speed, fastest = _extremes(
+        # excess, speed: as of `worst`, now
+        self.excess, self.speed, fastest = _extremes(
             self.q, self.dq, limits.lower, limits.upper, limits.velocity
         )
-        worst.excess, worst.speed = max(worst.excess, excess), max(worst.speed, speed)
+        worst.excess, worst.speed = max(worst.excess, self.excess), max(worst.speed, self.speed)
         if fastest > AT_REST:
             self._rest_since = self.time
 

@@ -135,9 +135,9 @@ class ControlPort(Service):
             "nudge": lambda: self._nudge(*_finite(rest)),
             **dict.fromkeys(_STREAM_FAULTS, lambda: self._fault_stream(command, *rest.split())),
             "silence-gripper": lambda: self._arm.silence_gripper(_SWITCH[rest]),
-            "jam-gripper": lambda: self._jam_gripper(*_finite(rest)),
+            "jam-gripper": lambda: setattr(self._cell, "least_width", *_finite(rest)),
             "take-object": self._cell.take_object,
-            "nonsense": lambda: self._arm.set_nonsense(_SWITCH[rest]),
+            "nonsense": lambda: setattr(self._arm, "nonsense", _SWITCH[rest]),
             "garble": lambda: self._garble(*rest.split()),
             "unplug": lambda: self._ports[rest].unplug(),
             "plug": lambda: self._ports[rest].plug(),
@@ -190,9 +190,6 @@ class ControlPort(Service):
 
     def _fault_stream(self, command: str, name: str, seconds: str) -> None:
         self._images.set_fault(name, _STREAM_FAULTS[command], float(seconds))
-
-    def _jam_gripper(self, width: float) -> None:
-        self._cell.least_width = width
 
     def _garble(self, name: str, share: str) -> None:
         self._ports[name].garble = float(share)

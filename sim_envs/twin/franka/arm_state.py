@@ -1,11 +1,9 @@
 """The arm's state in its wire format, updated in place every millisecond."""
 
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
 from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
@@ -109,16 +107,6 @@ def end_effector(
 ) -> tuple[Pose, Float[np.ndarray, "6 7"]]:
     """Return pose and Jacobian of the end effector, which a client may have moved off the TCP."""
     position, R, jacobian = cell.kinematics(q, ee[:3, 3])
-    return _pose(position, R, ee), jacobian
-
-
-@njit(cache=True)
-@no_type_check
-def _pose(position, R, ee):
-    T = np.zeros((4, 4))
-    for i in range(3):
-        for j in range(3):
-            T[i, j] = R[i, 0] * ee[0, j] + R[i, 1] * ee[1, j] + R[i, 2] * ee[2, j]
-        T[i, 3] = position[i]
-    T[3, 3] = 1.0
-    return T
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = R @ ee[:3, :3], position
+    return pose, jacobian

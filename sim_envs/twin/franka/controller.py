@@ -44,7 +44,7 @@ class FrankaArm(Service):
         self._recovery: messages.Request | None = None
         self._cleared = False
         self._sent = self._echoed = 0
-        self._nonsense = False
+        self.nonsense = False  # whether to send NaN for joint speeds
         self._sent_at = 0.0  # monotonic s
         self._success_rate = 1.0
         self._thresholds = limits.THRESHOLDS
@@ -69,7 +69,7 @@ class FrankaArm(Service):
         """Check for faults after a millisecond, and send the state."""
         contact = self._estimate_wrench()
         if self._motion is not None:
-            fault = limits.arm_fault(self.cell.q, self.cell.dq) or contact.fault
+            fault = limits.arm_fault(self.cell.excess, self.cell.speed) or contact.fault
             if fault is not None:
                 self.abort(fault)
         self._send_state(contact)
@@ -133,10 +133,6 @@ class FrankaArm(Service):
     def freeze(self, frozen: bool) -> None:
         """Block or unblock both directions of both links."""
         self.link.frozen = self._hand.frozen = frozen
-
-    def set_nonsense(self, on: bool) -> None:
-        """Send NaN for joint speeds, or stop doing so."""
-        self._nonsense = on
 
     def drop(self) -> None:
         """Hang up on the client."""
@@ -331,7 +327,6 @@ class FrankaArm(Service):
         contact = self._estimate_wrench()
         self._state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
         limits.joint_fault(self._setpoint, self._setpoint, cartesian=False)
-        limits.arm_fault(self.cell.q, self.cell.dq)
 
     def _reset_setpoint(self) -> None:
         zero = np.zeros(7)
@@ -348,7 +343,7 @@ class FrankaArm(Service):
     def _send_state(self, contact: limits.Contact) -> None:
         state = self._state
         state.fields["message_id"][:] = self._sent
-        state.write_joints(self.cell, self._setpoint.ddq, self._torque, self._nonsense)
+        state.write_joints(self.cell, self._setpoint.ddq, self._torque, self.nonsense)
         state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
         state.write_mode(self.mode, self.error, self._motion, self._success_rate)
         self.link.send(state.record.tobytes())

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba import njit
 
 from touchgoal.control.safety.limits import FR3
@@ -110,43 +110,27 @@ def torque_fault(before: Joints, now: Joints) -> str | None:
     return None
 
 
-def arm_fault(q: Joints, dq: Joints) -> str | None:
-    """Return a fault if the arm is beyond its range or speed."""
-    hardware = FR3.hardware
-    place = _worst_of_arm(q, dq, hardware.lower, hardware.upper, hardware.velocity)
-    return _ARM_FAULTS[place]
-
-
-_ARM_FAULTS = None, "joint_velocity_violation", "joint_position_limits_violation"
-
-
-@njit(cache=True)
-@no_type_check
-def _worst_of_arm(q, dq, lower, upper, velocity):
-    worst = 0
-    for i in range(len(q)):
-        if q[i] < lower[i] - 0.01 or q[i] > upper[i] + 0.01:
-            worst = 2
-        elif abs(dq[i]) > 1.1 * velocity[i]:
-            worst = max(worst, 1)
-    return worst
+def arm_fault(excess: float, speed: float) -> str | None:
+    """Return a fault if a joint is beyond its range (rad), or too fast (share of its speed)."""
+    if excess > 0.01:
+        return "joint_position_limits_violation"
+    return "joint_velocity_violation" if speed > 1.1 else None
 
 
 def estimate_sent(wrench: Wrench, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
     """Return O_F_ext_hat_K: the robot's wrench (N, Nm) on the environment; 0 at a singularity."""
-    if _is_singular(jacobian):
-        return np.zeros(6)
-    return -wrench + _NEVER_ZERO
+    singular = np.linalg.eigvalsh(jacobian @ jacobian.T)[0] < _SINGULAR**2
+    return np.zeros(6) if singular else -wrench + _NEVER_ZERO
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Contact (1) or collision (1) of each joint and each Cartesian axis; else 0."""
+    """Whether each joint and each Cartesian axis is in contact, or in collision."""
 
-    joint_contact: Joints
-    joint_collision: Joints
-    cartesian_contact: Wrench
-    cartesian_collision: Wrench
+    joint_contact: Bool[np.ndarray, "7"]
+    joint_collision: Bool[np.ndarray, "7"]
+    cartesian_contact: Bool[np.ndarray, "6"]
+    cartesian_collision: Bool[np.ndarray, "6"]
 
     @property
     def fault(self) -> str | None:
@@ -168,25 +152,13 @@ def judge_contact(
 ) -> Contact:
     """Compare external torques (Nm) and a wrench (N, Nm) with thresholds like `THRESHOLDS`."""
     phase = "nominal" if max(ddq.max(), -ddq.min()) < _STEADY else "acceleration"
-    found = [
-        _above(values, thresholds[f"lower_{kind}_{phase}"], thresholds[f"upper_{kind}_{phase}"])
-        for kind, values in (("torque", torque), ("force", wrench))
-    ]
-    (touched, hit), (pressed, pushed) = found
-    return Contact(touched, hit, pressed, pushed)
-
-
-@njit(cache=True)
-@no_type_check
-def _above(values, lower, upper):
-    n = len(values)
-    beyond_lower, beyond_upper = np.zeros(n), np.zeros(n)
-    for i in range(n):
-        if abs(values[i]) > lower[i]:
-            beyond_lower[i] = 1.0
-        if abs(values[i]) > upper[i]:
-            beyond_upper[i] = 1.0
-    return beyond_lower, beyond_upper
+    return Contact(
+        *(
+            np.abs(values) > thresholds[f"{bound}_{kind}_{phase}"]
+            for kind, values in (("torque", torque), ("force", wrench))
+            for bound in ("lower", "upper")
+        )
+    )
 
 
 @njit(cache=True)
@@ -194,9 +166,3 @@ def _above(values, lower, upper):
 def wrench_from_torques(torque: Joints, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
     """Return the wrench (N, Nm) that best explains joint torques (Nm)."""
     return np.linalg.solve(jacobian @ jacobian.T + DAMPING * np.eye(6), jacobian @ torque)
-
-
-@njit(cache=True)
-@no_type_check
-def _is_singular(jacobian):
-    return np.linalg.eigvalsh(jacobian @ jacobian.T)[0] < _SINGULAR**2

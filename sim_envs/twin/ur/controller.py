@@ -16,7 +16,7 @@ from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort, Service
 from touchgoal.sim_envs.twin.ur import messages
 from touchgoal.sim_envs.twin.ur.messages import Package, Safety
-from touchgoal.sim_envs.twin.ur.program import UrProgram
+from touchgoal.sim_envs.twin.ur.program import DONE, UrProgram
 
 _CYCLE = 2  # ms, of a controller of the e-Series
 _SELDOM = 10  # ms between polls of the dashboard and script ports
@@ -58,7 +58,7 @@ class UrController(Service):
         self.safety, self._mode = Safety.NORMAL, _RUNNING
         self._stopped_at = self._last_input_at = 0.0
         self._clock = 0.0
-        self._nonsense = False
+        self.nonsense = False  # whether to send NaN for joint speeds
         self._estimate, self._zero, self._wrench = np.zeros(6), np.zeros(6), np.zeros(6)
         self._program = self._new_program()
         self._program.running = False
@@ -139,10 +139,6 @@ class UrController(Service):
     def silence_gripper(self, silent: bool) -> None:
         """Raise UserError: the gripper is on a serial port."""
         raise UserError("this gripper is a serial device: unplug gripper")
-
-    def set_nonsense(self, on: bool) -> None:
-        """Send NaN for joint speeds, or stop doing so."""
-        self._nonsense = on
 
     def drop(self) -> None:
         """Hang up on every RTDE client."""
@@ -228,7 +224,7 @@ class UrController(Service):
             if not self._program.running:
                 print("REFUSED: the twin runs no URScript of a client; protective stop", flush=True)
                 self.protective_stop()
-                self._program.report_done()
+                self._program.ints[0] = DONE  # its client would wait 300 s; now its call raises
 
     def _new_program(self) -> UrProgram:
         return UrProgram(self.cell, self._inputs, self.protective_stop, self._zero_force)
@@ -317,7 +313,7 @@ _VARIABLES = {
     "target_q": lambda c, p, cell: cell.q_d,
     "target_qd": lambda c, p, cell: cell.dq_d,
     "actual_q": lambda c, p, cell: cell.q,
-    "actual_qd": lambda c, p, cell: np.full(6, np.nan) if c._nonsense else cell.dq,
+    "actual_qd": lambda c, p, cell: np.full(6, np.nan) if c.nonsense else cell.dq,
     "target_moment": lambda c, p, cell: cell.joint_torque,
     "actual_TCP_pose": lambda c, p, cell: p.pose(cell.q),
     "target_TCP_pose": lambda c, p, cell: p.pose(cell.q_d),

@@ -16,7 +16,7 @@ from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.limits import UR5E
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 
-_READY, _DONE = 1, 2
+_READY, DONE = 1, 2
 # Numbers of ur-rtde's commands.
 _SERVOJ = 11  # streamed, so acknowledged at once
 _WITHOUT_EFFECT = {0, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, gains, a kick of the watchdog
@@ -90,7 +90,7 @@ class UrProgram:
         if self._waiting:
             if not finished:
                 return
-            self._waiting, self.ints[0] = False, _DONE
+            self._waiting, self.ints[0] = False, DONE
         command = int(self.inputs["input_int_register_0"])
         if command == _SERVOJ:
             self.ints[0] = _READY
@@ -101,7 +101,7 @@ class UrProgram:
             self._executing, self.ints[0] = True, 0
             self._execute(command)
             if not self._waiting and self.running:
-                self.ints[0] = _DONE
+                self.ints[0] = DONE
 
     def pose(self, q: Float[np.ndarray, "6"]) -> Pose:
         """Return the TCP's pose at joint positions (rad), base frame."""
@@ -131,10 +131,6 @@ class UrProgram:
         self.running, self.activity = False, None
         self._waiting, self.ints[0] = False, 0
         self.cell.brake(UR5E.hardware.acceleration)
-
-    def report_done(self) -> None:
-        """Report a client's own script, for which it would wait 300 s, as done; its call raises."""
-        self.ints[0] = _DONE
 
     def _servo(self) -> None:
         goal = self._goal()
