@@ -13,9 +13,9 @@ from touchgoal.sim_envs.cell.hardware import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.config import Outcome
 from touchgoal.sim_envs.experts.pick_place_plans import (
     LONGEST_PLAN,
+    PLANS,
     SLIDE,
     Plan,
-    make_plan,
     picked_body,
 )
 from touchgoal.sim_envs.pick_place import PickPlace
@@ -26,16 +26,14 @@ OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 class PickPlaceExpert(Actor):
     """Picks and places, or does what `outcome` says (`touchgoal.sim_envs.config.Outcome`)."""
 
-    def __init__(
-        self, env: PickPlace, outcome: Outcome = "success", plan: Plan | None = None
-    ) -> None:
-        """Plan an episode right after its reset; `plan` is followed in place of the outcome's.
+    def __init__(self, env: PickPlace, outcome: Outcome = "success") -> None:
+        """Plan an episode right after its reset.
 
         UserError: no such outcome, or one that this scene or time limit does not allow.
         """
         _check(env, outcome)
         self._env, self._picked = env, picked_body(outcome)
-        self._actions = self._follow(plan or make_plan(env, outcome))
+        self._actions = self._follow(PLANS[outcome](env))
 
     def act(self, observation: Observation) -> np.ndarray:
         """Return the next action, from ground truth; no motion once the plan is over."""

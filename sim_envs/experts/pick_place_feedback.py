@@ -38,16 +38,16 @@ class FeedbackExpert(Actor):
     def __init__(
         self,
         env: PickPlace,
-        object_error: Float[np.ndarray, "3"] | None = None,
-        goal_error: Float[np.ndarray, "3"] | None = None,
+        object_error: Float[np.ndarray, "3"] | float = 0.0,
+        goal_error: Float[np.ndarray, "3"] | float = 0.0,
     ) -> None:
         """Begin an episode right after its reset; by `object_error` and `goal_error` (m) it errs."""
         self._env = env
         self._object, self._yaw = env.object_pose()[:3].copy(), env.grasp_yaw()
         self._object[2] = max(self._object[2], pick_place_plans.LOWEST_GRASP)
         self._goal = np.array([*env.goal, self._object[2]])
-        self._object += 0 if object_error is None else object_error
-        self._goal += 0 if goal_error is None else goal_error
+        self._object += object_error
+        self._goal += goal_error
         self._before, _ = env.kinematics.forward(env.command)
         self._width = env.width()
 

@@ -46,11 +46,6 @@ class Waypoint:
 Plan = list[Waypoint]
 
 
-def make_plan(env: PickPlace, outcome: Outcome) -> Plan:
-    """Return the plan that leads to an outcome, from ground truth after a reset."""
-    return _PLANS[outcome](env)
-
-
 def picked_body(outcome: Outcome) -> str:
     """Return the name of the body that the hand takes."""
     return "distractor_1" if outcome == "wrong_object" else "object"
@@ -167,7 +162,7 @@ def _regrasped(env: PickPlace) -> Plan:
     ]
 
 
-_PLANS: dict[Outcome, Callable[[PickPlace], Plan]] = {
+PLANS: dict[Outcome, Callable[[PickPlace], Plan]] = {
     "success": _pick_and_place,
     "slow": lambda env: [replace(w, seconds=2 * w.seconds) for w in _pick_and_place(env)],
     "regrasped": _regrasped,
@@ -186,6 +181,7 @@ _PLANS: dict[Outcome, Callable[[PickPlace], Plan]] = {
     "wrong_object": partial(_pick_and_place, body=picked_body("wrong_object")),
     "same_shape": _pick_and_place,  # the scene holds another object than the one asked for
 }
+"""What makes the plan that leads to an outcome, from ground truth after a reset."""
 
 
 def _before(plan: Plan, name: str) -> Plan:
