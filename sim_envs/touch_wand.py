@@ -20,7 +20,7 @@ from touchgoal.runtime.option_types import Seed, checked_dataclass
 from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
 from touchgoal.sim_envs.tactile.optics import render_untouched
-from touchgoal.sim_envs.tactile.pad import TactilePad
+from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 from touchgoal.sim_envs.wand.bench import VIEWS, Bench
 from touchgoal.sim_envs.wand.objects import WandObject, find_wand_object, wand_objects
@@ -91,6 +91,9 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012
+    # From the first reset on: the scene, and the object on it.
+    bench: Bench
+    object: WandObject
 
     def __init__(
         self, config: TouchWandConfig | None = None, render_mode: str | None = None, **options: Any
@@ -105,22 +108,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         self._instance = sample_instance(self._sensor, np.random.default_rng([self.config.gel, 17]))
         self.action_space = gym.spaces.Box(-1, 1, (6,), np.float32)
         self.observation_space = gym.spaces.Dict(self._spaces())
-        self._bench: Bench | None = None
-        self._pad: TactilePad | None = None
         self._renderer: Renderer | None = None
-        self._object: WandObject | None = None
-
-    @property
-    def bench(self) -> Bench:
-        """The scene."""
-        assert self._bench is not None, "reset first"
-        return self._bench
-
-    @property
-    def object(self) -> WandObject:
-        """The object on the bench."""
-        assert self._object is not None, "reset first"
-        return self._object
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -130,7 +118,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         names = list(wand_objects())
         drawn = names[int(self.np_random.integers(len(names)))]
         name = (options or {}).get("object") or self.config.object or drawn
-        if self._object is None or self._object.name != name:
+        if not hasattr(self, "object") or self.object.name != name:
             self._open(find_wand_object(name))
         self.move_object()
         bench = self.bench
@@ -169,8 +157,9 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         before = self._render()
         bench.place_wand(tip, axes)
         force = (action[5] + 1) / 2 * MAX_FORCE
-        clip, load, wrench = self._press(tip, force * np.linspace(0, 1, CLIP))
-        return Touch(before, self._render(), clip, load, wrench)
+        forces = force * np.linspace(0, 1, CLIP)
+        clip, wrench = self._press(tip, forces)
+        return Touch(before, self._render(), clip, forces.astype(np.float32), wrench)
 
     def untouched(self, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
         """Return the untouched gel's image, with the camera's noise drawn from `rng`."""
@@ -186,10 +175,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
 
     def render(self) -> UInt8[np.ndarray, "H W 3"]:
         """Return the view from the left."""
-        bench = self.bench
-        assert self._renderer is not None
-        self._renderer.update_scene(bench.data, "side_left", bench.shown)
-        return self._renderer.render()
+        return self._view("side_left")
 
     def close(self) -> None:
         """Free the renderer."""
@@ -211,11 +197,11 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
     def _open(self, wand_object: WandObject) -> None:
         """Build another object's scene."""
         self.close()
-        bench = Bench(wand_object, VIEW_SHAPE)
-        self._pad = TactilePad(bench.model, "left", self._sensor, self._instance, bench.bodies)
+        self.bench, self.object = Bench(wand_object, VIEW_SHAPE), wand_object
+        model, bodies = self.bench.model, self.bench.bodies
+        self._pad = TactilePad(model, "left", self._sensor, self._instance, bodies)
         if self.config.views or self.render_mode:
-            self._renderer = open_renderer(bench.model, *VIEW_SHAPE)
-        self._bench, self._object = bench, wand_object
+            self._renderer = open_renderer(model, *VIEW_SHAPE)
 
     def move_object(self) -> None:
         """Move and turn the object on the bench at random, as the paper's operator before each touch."""
@@ -224,31 +210,27 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
 
     def _press(
         self, point: Float[np.ndarray, "3"], forces: Float[np.ndarray, " t"]
-    ) -> tuple[UInt8[np.ndarray, "t h w 3"], Float32[np.ndarray, " t"], Float32[np.ndarray, "t 6"]]:
-        """Press with rising forces (N) where the wand is; return images, loads and wrenches."""
-        bench, pad = self.bench, self._pad
-        assert pad is not None
-        geoms = bench.geoms_near(point, _PATCH)
-        images, wrenches = [], []
-        for force in forces:
-            contact = PadContact(np.array([0, 0, -force]), np.zeros(3), 0.0, geoms)
-            frame = pad.sense(bench.data, contact, self.np_random)
-            images.append(frame.image)
-            wrenches.append(np.zeros(6) if frame.field is None else frame.field.wrench())
-        return np.stack(images), forces.astype(np.float32), np.array(wrenches, np.float32)
+    ) -> tuple[UInt8[np.ndarray, "t h w 3"], Float32[np.ndarray, "t 6"]]:
+        """Press with rising forces (N) where the wand is; return images and wrenches."""
+        geoms = self.bench.geoms_near(point, _PATCH)
+        frames = [self._sense(force, geoms, self.np_random) for force in forces]
+        fields = [frame.field for frame in frames]
+        wrenches = [np.zeros(6) if field is None else field.wrench() for field in fields]
+        return np.stack([frame.image for frame in frames]), np.array(wrenches, np.float32)
+
+    def _sense(self, force: float, geoms: frozenset[int], rng: np.random.Generator) -> TactileFrame:
+        contact = PadContact(np.array([0, 0, -force]), np.zeros(3), 0.0, geoms)
+        return self._pad.sense(self.bench.data, contact, rng)
 
     def _aim(
         self, point: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "3"]:
         """Return where to put the gel's middle: most of the way to the centre of a light touch."""
-        bench, pad = self.bench, self._pad
-        assert pad is not None
         tip = point
         for _ in range(2):
-            bench.place_wand(tip, axes)
-            geoms = bench.geoms_near(tip, _PATCH)
-            contact = PadContact(np.array([0, 0, -_FEELER]), np.zeros(3), 0.0, geoms)
-            field = pad.sense(bench.data, contact, np.random.default_rng(0)).field
+            self.bench.place_wand(tip, axes)
+            geoms = self.bench.geoms_near(tip, _PATCH)
+            field = self._sense(_FEELER, geoms, np.random.default_rng(0)).field
             if field is None or not field.normal.any():
                 break
             rows, columns = np.indices(field.normal.shape) * field.pitch
@@ -259,14 +241,12 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         return tip
 
     def _render(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
-        if not self.config.views:
-            return {}
-        views = {}
+        return {name: self._view(name) for name in VIEWS} if self.config.views else {}
+
+    def _view(self, name: str) -> UInt8[np.ndarray, "H W 3"]:
         assert self._renderer is not None
-        for name in VIEWS:
-            self._renderer.update_scene(self.bench.data, name, self.bench.shown)
-            views[name] = self._renderer.render()
-        return views
+        self._renderer.update_scene(self.bench.data, name, self.bench.shown)
+        return self._renderer.render()
 
     def _observation(
         self,
@@ -278,7 +258,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         return observation | {ft.TACTILE_LEFT: image, ft.LOAD: np.array([load], np.float32)}
 
     def _observe_untouched(self) -> Observation:
-        clip, _, _ = self._press(np.zeros(3), np.zeros(1))
+        clip, _ = self._press(np.zeros(3), np.zeros(1))
         return self._observation(self._render(), clip[-1], 0.0)
 
     def _info(self, touched: bool) -> dict[str, Any]:
