@@ -59,10 +59,9 @@ class ContactReader:
 
         The wrench is in the base frame.
         """
-        contacts, model = data.contact, self._model
-        geoms, addresses = contacts.geom, contacts.efc_address
+        contacts, model = _contacts(data), self._model
         wrenches, slip = _read_contacts(
-            Contacts(geoms, contacts.frame, contacts.pos, addresses, contacts.dim),
+            contacts,
             data.efc_force,
             self._is_robot,
             self._pad_of,
@@ -70,7 +69,7 @@ class ContactReader:
             BodyMotion(model.geom_bodyid, model.body_rootid, data.cvel, data.subtree_com),
         )
         touching: tuple[set[int], set[int]] = set(), set()
-        for pair, address in zip(geoms.tolist(), addresses.tolist(), strict=True):
+        for pair, address in zip(contacts.geoms.tolist(), contacts.addresses.tolist(), strict=True):
             for geom, other in (pair, pair[::-1]):
                 if address >= 0 and geom in self._pads:
                     touching[self._pads[geom]].add(other)
@@ -84,11 +83,7 @@ class ContactReader:
 
     def external_force(self, data: mujoco.MjData) -> Float[np.ndarray, "3"]:
         """Return the force (N, base frame) of `read`'s external wrench, in a fraction of its time."""
-        contacts = data.contact
-        frames, addresses, sizes = contacts.frame, contacts.efc_address, contacts.dim
-        return _external_force(
-            contacts.geom, frames, addresses, sizes, data.efc_force, self._is_robot
-        )
+        return _force_on(self._is_robot, _contacts(data), data.efc_force)
 
     def joint_torque(self, data: mujoco.MjData) -> Float[np.ndarray, " nv"]:
         """Return the generalised force of all contacts, J^T f; internal forces cancel."""
@@ -98,14 +93,8 @@ class ContactReader:
 
     def load(self, data: mujoco.MjData, geom: int) -> float:
         """Return the force (N) that presses down on a geom."""
-        force, wrench = 0.0, np.zeros(6)
-        for i in range(data.ncon):
-            contact = data.contact[i]
-            if geom in contact.geom and contact.efc_address >= 0:
-                mujoco.mj_contactForce(self._model, data, i, wrench)
-                f = contact.frame.reshape(3, 3).T @ wrench[:3]
-                force += -f[2] if contact.geom[1] == geom else f[2]
-        return float(force)
+        chosen = np.arange(self._model.ngeom) == geom
+        return 0.0 - float(_force_on(chosen, _contacts(data), data.efc_force)[2])  # never -0
 
     def touches(self, data: mujoco.MjData, one: int, other: int) -> bool:
         """Return whether two geoms are in contact."""
@@ -120,6 +109,11 @@ class Contacts(NamedTuple):
     points: Float[np.ndarray, "k 3"]
     addresses: Int[np.ndarray, " k"]
     sizes: Int[np.ndarray, " k"]
+
+
+def _contacts(data: mujoco.MjData) -> Contacts:
+    found = data.contact
+    return Contacts(found.geom, found.frame, found.pos, found.efc_address, found.dim)
 
 
 class BodyMotion(NamedTuple):
@@ -164,15 +158,17 @@ def _read_contacts(contacts, forces, is_robot, pad_of, origins, moving):
 
 @njit(cache=True)
 @no_type_check
-def _external_force(geoms, frames, addresses, sizes, forces, is_robot):
+def _force_on(chosen, contacts, forces):
+    """Return the force (N, world frame) of all other geoms on the chosen ones."""
     total = np.zeros(3)
-    for i in range(addresses.size):
-        on_first, on_second = is_robot[geoms[i, 0]], is_robot[geoms[i, 1]]
-        if addresses[i] < 0 or on_first == on_second:
+    for i in range(contacts.addresses.size):
+        first, second = contacts.geoms[i]
+        address = contacts.addresses[i]
+        if address < 0 or chosen[first] == chosen[second]:
             continue
-        sign = 1.0 if on_second else -1.0
-        for k in range(min(sizes[i], 3)):
-            total += sign * forces[addresses[i] + k] * frames[i, 3 * k : 3 * k + 3]
+        sign = 1.0 if chosen[second] else -1.0
+        for k in range(min(contacts.sizes[i], 3)):
+            total += sign * forces[address + k] * contacts.frames[i, 3 * k : 3 * k + 3]
     return total
 
 
