@@ -24,8 +24,6 @@ _MAX_CORRECTION = 0.9  # share of a cell's normal force
 # Where the patch cannot carry both, torsion yields to force.
 _REGULARIZATION, _REGULARIZATION_TORSION = 1e-5, 1e-3
 _FORCE_TOLERANCE = 1e-4  # share of the friction limit
-_SQUARES = 24  # rows and columns of an image's tractions
-_FINE = 4  # samples along each side of such a square
 
 
 @dataclass(frozen=True)
@@ -280,22 +278,3 @@ def resample_to_image(
     size = image.columns, image.rows
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(values.astype(np.float32), to_cells, size, flags=flags)
-
-
-def tractions(
-    field: ForceField | None, shape: tuple[int, int], pitch: float
-) -> Float32[np.ndarray, "3 24 24"]:
-    """Return shear along x and y and pressure over an image, kPa, averaged over 24 x 24 cells.
-
-    Args:
-        field: the contact's forces; None without contact.
-        shape: rows and columns of the image of `pitch` m per pixel.
-    """
-    if field is None:
-        return np.zeros((3, _SQUARES, _SQUARES), np.float32)
-    step = max(shape) * pitch / (_SQUARES * _FINE)
-    fine = Grid(round(shape[0] * pitch / step), round(shape[1] * pitch / step), step)
-    stress = np.stack([*field.tangential, field.normal]) / (1e3 * field.pitch**2)
-    planes = (resample_to_image(plane, field, fine) for plane in stress)
-    size = _SQUARES, _SQUARES
-    return np.stack([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in planes])

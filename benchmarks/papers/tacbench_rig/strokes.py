@@ -9,6 +9,7 @@ gel moves along and its shear force grows; at the friction cone the probe slides
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
@@ -16,7 +17,8 @@ from benchmarks.papers.tacbench_rig.config import Indenter, RigConfig, rig_unit
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.object_slides import FRICTION, REST, stick_slip_force
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Shape, Texture
-from touchgoal.sim_envs.tactile.forces import tractions
+from touchgoal.sim_envs.tactile.forces import ForceField, resample_to_image
+from touchgoal.sim_envs.tactile.geometry import Grid
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 
 FRICTION_SPREAD = 0.15  # largest relative deviation of a stroke's friction from `FRICTION`
@@ -27,6 +29,8 @@ _SLIDE_FRAMES = 12, 25
 _SLIDES = 0.5, 3.0  # slide as a multiple of the distance that friction holds
 _WOBBLE = 0.05  # relative change of the load while sliding
 _TIP, _CONE, _OPENING = 0.3e-3, 4e-3, math.radians(120)  # sharp probe: m, m, rad
+_SQUARES = 24  # rows and columns of an image's tractions
+_FINE = 4  # samples along each side of such a square
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +41,7 @@ class Stroke:
     # force (N) and torque (Nm) of the probe on the pad, sensor frame; pressed is -z
     wrench: Float32[np.ndarray, "t 6"]
     slip: Bool[np.ndarray, " t"]  # whether the probe slides over the gel
-    field: Float32[np.ndarray, "t 3 24 24"]  # kPa, `forces.tractions`; not in recordings
+    field: Float32[np.ndarray, "t 3 24 24"]  # kPa, `_tractions`; not in recordings
     indenter: Indenter
     load: float  # largest normal load, N
     friction: float  # coefficient of this stroke
@@ -59,10 +63,29 @@ def simulate(config: RigConfig, index: int) -> Stroke:
         bench.place(np.array([x, y, 0.0]))
         sensed = bench.sense(pressed, rng, (fx, fy), (x, y), -pressed / sensor.normal_stiffness)
         frames.append(sensed.image)
-        fields.append(tractions(sensed.field, sensor.image_shape, unit.pixel_pitch))
+        fields.append(_tractions(sensed.field, sensor.image_shape, unit.pixel_pitch))
         wrenches.append(np.concatenate([bench.contact.force, bench.contact.torque]))
     wrench = np.array(wrenches, np.float32)
     return Stroke(np.stack(frames), wrench, slip, np.stack(fields), indenter, load.max(), friction)
+
+
+def _tractions(
+    field: ForceField | None, shape: tuple[int, int], pitch: float
+) -> Float32[np.ndarray, "3 24 24"]:
+    """Return shear along x and y and pressure over an image, kPa, averaged over 24 x 24 cells.
+
+    Args:
+        field: the contact's forces; None without contact.
+        shape: rows and columns of the image of `pitch` m per pixel.
+    """
+    if field is None:
+        return np.zeros((3, _SQUARES, _SQUARES), np.float32)
+    step = max(shape) * pitch / (_SQUARES * _FINE)
+    fine = Grid(round(shape[0] * pitch / step), round(shape[1] * pitch / step), step)
+    stress = np.stack([*field.tangential, field.normal]) / (1e3 * field.pitch**2)
+    planes = (resample_to_image(plane, field, fine) for plane in stress)
+    size = _SQUARES, _SQUARES
+    return np.stack([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in planes])
 
 
 def _draw_path(
