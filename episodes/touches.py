@@ -23,9 +23,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
 _VIEW_FRAMES_BEFORE_CONTACT = 5
-_SAME_SENSOR = (
-    1.0  # counts of local change of one sensor between two days; noise of 1 count gives 0.3
-)
+# counts of local change of one sensor between two days; noise of 1 count gives 0.3
+_SAME_SENSOR = 1.0
 _LOOKED_AT = 8  # episodes of a set whose first frames are checked
 
 
@@ -124,7 +123,8 @@ def draw_frames(
     for column, side in enumerate(sides):
         rows, key = np.flatnonzero(picked[:, 1] == column), TACTILE[side]
         frames[rows] = episodes.read(i, [key], picked[rows, 0].tolist()).frames[key]
-    background = [_background(episodes, i, side) for side in sides]
+    first = _first_frames(episodes, i, [TACTILE[side] for side in sides])
+    background = [touch_background(images) for images in first.values()]
     in_contact = contact[picked[:, 0], picked[:, 1]]
     return DrawnFrames(frames, picked[:, 1], in_contact, background, contact)
 
@@ -155,8 +155,7 @@ def check_fingertips(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
     looked_at = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)]
     first: list[UInt8[np.ndarray, "h w 3"]] = []
     for i in sorted(set(looked_at)) if keys else ():
-        start = range(min(SETTLES_WITHIN, episodes.lengths[i]))
-        read = episodes.read(i, keys, start).frames
+        read = _first_frames(episodes, i, keys)
         frames = [read[key][0] for key in keys]
         sensor = SENSORS.get(str(episodes.meta(i).get("sensor")))
         for key in keys:
@@ -202,34 +201,19 @@ def contact_detector(frames: UInt8[np.ndarray, "n h w 3"]) -> ContactDetector:
     return ContactDetector(Background(background[None]), threshold_for(untouched, background))
 
 
-class ContactStream:
-    """Contact of one fingertip over consecutive pieces of a recording.
-
-    The first piece begins with 5 frames without contact, unless `untouched` ones are given.
-    """
-
-    def __init__(self, untouched: UInt8[np.ndarray, "n h w 3"] | None = None) -> None:
-        self._detector = None if untouched is None else contact_detector(untouched)
-
-    def update(self, frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, " t"]:
-        """Return whether each of the next frames is in contact."""
-        if self._detector is None:
-            self._detector = contact_detector(frames)
-        return np.array([self._detector.update(frame) for frame in frames], bool)
-
-
-def _background(episodes: EpisodeSet, i: int, side: int) -> UInt8[np.ndarray, "h w 3"]:
-    key = TACTILE[side]
-    first = range(min(SETTLES_WITHIN, episodes.lengths[i]))
-    return touch_background(episodes.read(i, [key], first).frames[key])
+def _first_frames(episodes: EpisodeSet, i: int, keys: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the frames of fingertips in which the light settles."""
+    return episodes.read(i, keys, range(min(SETTLES_WITHIN, episodes.lengths[i]))).frames
 
 
 def _contact(episodes: EpisodeSet, i: int, sides: list[int]) -> Bool[np.ndarray, "t s"]:
     if TRUTH_CONTACT in episodes.features:
         return episodes.read(i, [TRUTH_CONTACT]).frames[TRUTH_CONTACT][:, sides]
-    keys = [TACTILE[side] for side in sides]
-    frames = episodes.read(i, keys).frames
-    return np.stack([ContactStream().update(frames[key]) for key in keys], axis=1)
+    contact = []
+    for images in episodes.read(i, [TACTILE[side] for side in sides]).frames.values():
+        detector = contact_detector(images)
+        contact.append([detector.update(image) for image in images])
+    return np.array(contact, bool).T
 
 
 def _sample_frames(
