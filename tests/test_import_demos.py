@@ -17,7 +17,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.sensors.clip import read_frames
 from touchgoal.episodes.importers.feature_map import FeatureMap, Part, propose_map
 from touchgoal.episodes.importers.find_recordings import find_recordings
-from touchgoal.episodes.importers.streams import RawEpisode, Stream, held
+from touchgoal.episodes.importers.streams import RawEpisode, Stream
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
@@ -219,7 +219,7 @@ def test_a_table_with_videos_in_degrees_and_millimetres(here: Path) -> None:
 
 def numbers(n: int = 20, rate: float = 10.0, names: tuple[str, ...] = ()) -> Stream:
     values = RNG.normal(size=(n, len(names) or 8))
-    return Stream(np.arange(n) / rate, values.shape[1:], held(values), names)
+    return Stream(np.arange(n) / rate, values.shape[1:], values.__getitem__, names)
 
 
 def test_a_map_reorders_scales_and_never_reads_ahead() -> None:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.episodes.importers.streams import RawEpisode, Stream, held
+from touchgoal.episodes.importers.streams import RawEpisode, Stream
 from touchgoal.runtime.errors import UserError, install_extra
 from touchgoal.runtime.image_file import decode_image
 
@@ -74,7 +74,7 @@ def read_bag(path: Path) -> RawEpisode:
         # a joint state that changes its joints is none
         elif len({v.shape for v in values[name]}) == 1:
             rows = np.stack(values[name])[order]
-            streams[name] = Stream(at, rows.shape[1:], held(rows), names[name])
+            streams[name] = Stream(at, rows.shape[1:], rows.__getitem__, names[name])
     if not streams:
         raise UserError(f"{path} holds no images, joint states, poses, wrenches or numbers")
     return RawEpisode(path.stem, streams)
@@ -113,10 +113,8 @@ def _numbers(topic: str, kind: str, message: Any) -> dict[str, tuple[np.ndarray,
             n: np.array(getattr(message, n), float) for n in ("position", "velocity", "effort")
         }
         return {f"{topic}.{n}": (v, joints) for n, v in parts.items() if len(v)}
-    if kind.endswith(_SCALARS):
-        return {topic: (np.array([message.data], float), ())}
-    if kind.endswith(_ARRAYS):
-        return {topic: (np.array(message.data, float), ())}
+    if kind.endswith(_SCALARS + _ARRAYS):
+        return {topic: (np.array(message.data, float, ndmin=1), ())}
     inside, parts = next(v for end, v in _FIELDS.items() if kind.endswith(end))
     part = getattr(message, inside) if inside else message
     return {topic: (np.array([attrgetter(name)(part) for name in parts]), parts)}

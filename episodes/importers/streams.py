@@ -30,10 +30,3 @@ class RawEpisode:
     name: str
     streams: dict[str, Stream]
     success: bool | None = None  # None: it does not tell
-
-
-def held(
-    values: Shaped[np.ndarray, "n ..."],
-) -> Callable[[Int[np.ndarray, " k"]], Shaped[np.ndarray, "k ..."]]:
-    """Return what reads samples that lie in memory, for a `Stream`."""
-    return lambda rows: values[rows]

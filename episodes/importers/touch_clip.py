@@ -39,7 +39,11 @@ class TouchClip:
 
         UserError: one of them is broken, or of another size than the others.
         """
-        images = [self._frame(int(row)) for row in rows]
+        images = []
+        for row in map(int, rows):
+            image = decode(self.images[row], f"image {row} of {self.name}")
+            image = image[:, :, ::-1] if self.red_and_blue_exchanged else image
+            images.append(turned(image, self.sensor))
         if len({image.shape for image in images}) > 1:
             raise UserError(f"{self.name} holds images of different sizes: make them equal")
         return np.stack(images)
@@ -48,12 +52,6 @@ class TouchClip:
         """Return the median of images spread over the clip: the untouched gel where contact moves."""
         rows = np.linspace(0, len(self) - 1, min(_MEDIAN_IMAGES, len(self))).astype(int)
         return np.median(self.frames(rows), 0).astype(np.uint8)
-
-    def _frame(self, row: int) -> Image:
-        image = decode(self.images[row], f"image {row} of {self.name}")
-        if self.red_and_blue_exchanged:
-            image = image[:, :, ::-1]
-        return turned(image, self.sensor)
 
 
 def decode(data: bytes, name: str) -> Image:

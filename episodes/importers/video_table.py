@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from touchgoal.control.sensors.clip import VIDEOS, Clip, open_clip
-from touchgoal.episodes.importers.streams import RawEpisode, Stream, held
+from touchgoal.episodes.importers.streams import RawEpisode, Stream
 from touchgoal.runtime.errors import UserError
 
 _TIMES = ("time", "timestamp", "t")
@@ -46,7 +46,7 @@ def read_video_table(folder: Path) -> RawEpisode:
         if name != time:
             columns[re.sub(r"[._\[]?\d+\]?$", "", name) or name].append(k)
     streams = {
-        name: Stream(times, (len(of),), held(values[:, of]), tuple(head[k] for k in of))
+        name: Stream(times, (len(of),), values[:, of].__getitem__, tuple(head[k] for k in of))
         for name, of in columns.items()
     }
     for path in _videos(folder):
