@@ -1,7 +1,6 @@
 """Check by ground truth that a simulated episode of pick-place came out as it was asked to."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,17 +17,24 @@ _OFF_CENTRE = 0.004  # m in the hand; successes stay within 0.003
 _SLID = 0.004  # m in the hand between lifting and the end
 
 
-@dataclass(frozen=True)
 class Truth:
-    """Ground truth of one episode of `n` frames."""
+    """Ground truth of a recorded episode of pick-place, of `n` frames."""
 
-    touched: Bool[np.ndarray, " n"]  # whether a pad touches something
-    height: Float[np.ndarray, " n"]  # of the object above its start, m
-    away: Float[np.ndarray, " n"]  # of the object from the goal, m, over the table
-    in_hand: Float[np.ndarray, "n 3"]  # object in the TCP frame, m
-    pressing: Float[np.ndarray, " n"]  # force that pushes the hand up, N
-    grip: Float[np.ndarray, "n 2"]  # normal force on each pad, N
-    success: bool  # of the task
+    def __init__(self, frames: Mapping[str, np.ndarray]) -> None:
+        place, start = frames[ft.TRUTH_OBJECT_POSE][:, :3], frames[ft.TRUTH_START]
+        position, turn = np.split(frames[ft.TCP_POSE], [3], axis=1)
+        hand = Rotation.from_quat(turn, scalar_first=True)
+        # whether a pad touches something
+        self.touched: Bool[np.ndarray, " n"] = frames[ft.TRUTH_CONTACT].any(axis=1)
+        # of the object above its start, and from the goal over the table, m
+        self.height: Float[np.ndarray, " n"] = place[:, 2] - start[:, 2]
+        self.away: Float[np.ndarray, " n"] = np.linalg.norm(place[:, :2] - start[:, 5:7], axis=1)
+        # object in the TCP frame, m
+        self.in_hand: Float[np.ndarray, "n 3"] = hand.apply(place - position, inverse=True)
+        # force that pushes the hand up, and normal force on each pad, N
+        self.pressing: Float[np.ndarray, " n"] = frames[ft.WRENCH][:, 2]
+        self.grip: Float[np.ndarray, "n 2"] = -frames[ft.TRUTH_PAD_WRENCH][:, [2, 8]]
+        self.success = bool(frames[ft.TRUTH_SUCCESS][-1, 0])  # of the task
 
     @property
     def held(self) -> bool:
@@ -55,27 +61,9 @@ class Truth:
         return float(np.linalg.norm(self.in_hand[-1] - self.in_hand[lifted[0]]))
 
 
-def read_truth(frames: Mapping[str, np.ndarray]) -> Truth:
-    """Return the ground truth of a recorded episode of pick-place."""
-    place, start = frames[ft.TRUTH_OBJECT_POSE][:, :3], frames[ft.TRUTH_START]
-    tcp = frames[ft.TCP_POSE]
-    offset = Rotation.from_quat(tcp[:, 3:], scalar_first=True).apply(
-        place - tcp[:, :3], inverse=True
-    )
-    return Truth(
-        touched=np.asarray(frames[ft.TRUTH_CONTACT].any(axis=1)),
-        height=place[:, 2] - start[:, 2],
-        away=np.linalg.norm(place[:, :2] - start[:, 5:7], axis=1),
-        in_hand=offset,
-        pressing=frames[ft.WRENCH][:, 2],
-        grip=-frames[ft.TRUTH_PAD_WRENCH][:, [2, 8]],
-        success=bool(frames[ft.TRUTH_SUCCESS][-1, 0]),
-    )
-
-
 def outcome_reached(outcome: Outcome, frames: Mapping[str, np.ndarray]) -> bool:
     """Return whether an episode ended as its expert was asked to end it."""
-    return bool(_CHECKS[outcome](read_truth(frames)))
+    return bool(_CHECKS[outcome](Truth(frames)))
 
 
 _CHECKS: dict[Outcome, Callable[[Truth], bool | np.bool_]] = {
