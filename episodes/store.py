@@ -196,11 +196,11 @@ class EpisodeSet:
         It covers every episode's length, task, meta, statistics and checksums of videos; of a foreign
         set all frames.
         """
-        rows: Iterator[Any] = (
-            (self.episode_checksum(i) for i in range(len(self)))
-            if self.foreign
-            else islice(episode_table.read_rows(self.root), len(self))
-        )
+        rows: Iterator[Any] = map(self.episode_checksum, range(len(self)))
+        if not self.foreign:
+            names = set_files.episodes_files(self.root)
+            files = (set_files.read_parquet(self.root, name) for name in names)
+            rows = islice(episode_table.rows_of(files), len(self))
         digest = hashlib.sha256(b"[")
         for i, row in enumerate(rows):
             digest.update((", " * (i > 0) + json.dumps(row, sort_keys=True)).encode())
@@ -274,8 +274,8 @@ class EpisodeSet:
         Third is the rate of the video, frames per second. UserError: the video is unreadable.
         """
         place = self._place(i).videos[self._stored[key]]
-        with self._readable(place.file):
-            length, fps = video_length(self._file(place.file))
+        with self._readable(place.file) as path:
+            length, fps = video_length(path)
         return place.n_frames, length - place.first_frame, fps
 
     def read(
@@ -313,10 +313,6 @@ class EpisodeSet:
             raise UserError(f"{self.root} has episodes 0 to {len(self) - 1}, not {i}")
         return i
 
-    def _file(self, name: str) -> Path:
-        """Return a file of the set, fetched if the set is remote."""
-        return remote.fetched(self.root, name)
-
     def _unreadable(self, name: str, error: Exception) -> UserError:
         """Return the error that a file is missing or broken; only own sets can be repaired."""
         if not self.foreign:
@@ -326,10 +322,10 @@ class EpisodeSet:
         return UserError(f"{self.root / name} is {reason}: copy the set again")
 
     @contextmanager
-    def _readable(self, name: str) -> Iterator[None]:
-        """Name the file in whatever goes wrong while it is read."""
+    def _readable(self, name: str) -> Iterator[Path]:
+        """Yield a file of the set, fetched if it is remote; name it in whatever goes wrong."""
         try:
-            yield
+            yield remote.fetched(self.root, name)
         except UserError as error:
             raise UserError(f"{self.root / name}: {error}") from error
         except (OSError, pa.ArrowException, av.error.FFmpegError, ValueError) as error:
@@ -340,8 +336,8 @@ class EpisodeSet:
     ) -> dict[str, np.ndarray]:
         place = self._place(i)
         with (
-            self._readable(place.data_file),
-            pq.ParquetFile(self._file(place.data_file), page_checksum_verification=True) as file,
+            self._readable(place.data_file) as path,
+            pq.ParquetFile(path, page_checksum_verification=True) as file,
         ):
             rows = file.metadata.num_rows
             if place.alone and rows != place.length:
@@ -353,8 +349,7 @@ class EpisodeSet:
     def _stored_column(self, place: EpisodePlace, name: str, keep: bool = True) -> pa.Array:
         """Return a column of one episode; small ones are kept for the file's other episodes."""
         read = _read_column if keep else _read_column.__wrapped__
-        with self._readable(place.data_file):
-            path = self._file(place.data_file)
+        with self._readable(place.data_file) as path:
             column = read(path, path.stat().st_mtime_ns, name)
             return pa.concat_arrays(column.slice(place.first_row, place.length).chunks)
 
@@ -365,10 +360,8 @@ class EpisodeSet:
             stored = self._stored[key]
             if feature["dtype"] == "video":
                 video = place.videos[stored]
-                with self._readable(video.file):
-                    found[stored] = video_checksum(
-                        self._file(video.file), self.fps, video.first_frame, place.length
-                    )
+                with self._readable(video.file) as path:
+                    found[stored] = video_checksum(path, self.fps, video.first_frame, place.length)
             elif feature["dtype"] == "image":
                 images = self._stored_column(place, stored, keep=False).field("bytes")
                 found[stored] = [zlib.crc32(image.as_py()) for image in images]
@@ -381,7 +374,7 @@ class EpisodeSet:
         self, place: EpisodePlace, stored: str, frames: np.ndarray
     ) -> UInt8[np.ndarray, "n h w 3"]:
         video = place.videos[stored]
-        source: bytes | Path = self._file(video.file)
+        source: bytes | Path = remote.fetched(self.root, video.file)
         if not self.foreign and video.crc32 is not None:
             source = set_files.read_video(self.root, video.file, video.crc32)
         with self._readable(video.file):

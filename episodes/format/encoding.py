@@ -26,14 +26,7 @@ from jaxtyping import Int, Shaped, UInt8
 from touchgoal.control.features import FEATURES
 from touchgoal.episodes.format import statistics
 from touchgoal.episodes.media import encode_video
-from touchgoal.episodes.schema import (
-    INDEX_DTYPES,
-    Episode,
-    MetaValue,
-    describe_features,
-    is_camera,
-    is_image,
-)
+from touchgoal.episodes.schema import Episode, MetaValue, describe_features, is_camera, is_image
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.image_file import decode_image
@@ -122,27 +115,6 @@ def decode_png(png: bytes) -> UInt8[np.ndarray, "h w 3"]:
     if image is None:
         raise UserError("an image in the data file is no readable PNG")
     return image
-
-
-def index_columns(
-    length: int, fps: int, episode_index: int, first_index: int, task_index: int
-) -> dict[str, Shaped[np.ndarray, " n"]]:
-    """Return LeRobot's index columns of an episode at its place in a set.
-
-    Args:
-        fps: Frames per second; time stamps are exactly frame_index / fps seconds.
-        first_index: Number of frames in all episodes before it.
-        task_index: Row of its task in meta/tasks.parquet.
-    """
-    frame = np.arange(length)
-    columns = {
-        "timestamp": frame / fps,
-        "frame_index": frame,
-        "episode_index": np.full(length, episode_index),
-        "index": first_index + frame,
-        "task_index": np.full(length, task_index),
-    }
-    return {key: columns[key].astype(dtype) for key, dtype in INDEX_DTYPES.items()}
 
 
 def write_data_file(

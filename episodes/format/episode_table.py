@@ -4,7 +4,7 @@ A set may have millions of episodes, so facts and places stay in columns; the ob
 when it is asked for.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,10 +59,10 @@ def load_table(root: Path, leave_out: str | None = None) -> pa.Table:
     return joined if one else joined.replace_schema_metadata()
 
 
-def read_rows(root: Path) -> Iterator[Row]:
-    """Yield the rows of meta/episodes of a set of touchgoal's own, with statistics, file by file."""
-    for name in set_files.episodes_files(root):
-        for batch in set_files.read_parquet(root, name).to_batches(max_chunksize=_ROWS):
+def rows_of(tables: Iterable[pa.Table]) -> Iterator[Row]:
+    """Yield the rows of the files of meta/episodes, in order."""
+    for table in tables:
+        for batch in table.to_batches(max_chunksize=_ROWS):
             yield from batch.to_pylist()
 
 

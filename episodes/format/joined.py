@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from touchgoal.episodes.format import remote
-from touchgoal.episodes.format.metadata import dtype_and_shape
+from touchgoal.episodes.format.metadata import differing_features
 from touchgoal.episodes.format.statistics import Stats, merge
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
@@ -80,11 +80,7 @@ class JoinedSet(EpisodeSet):
 
 def _require_alike(first: EpisodeSet, other: EpisodeSet) -> None:
     """Raise UserError if two sets cannot be read as one."""
-    differing = [
-        key
-        for key in sorted({*first.features, *other.features})
-        if dtype_and_shape(first.features.get(key)) != dtype_and_shape(other.features.get(key))
-    ]
+    differing = differing_features(first.features, other.features)
     if first.fps != other.fps or differing:
         raise UserError(
             f"{first.root} and {other.root} differ in {(differing or ['rate'])[0]}: open sets "

@@ -13,14 +13,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from jaxtyping import Shaped
 
 from touchgoal.control.features import ACTION
 from touchgoal.episodes.format import set_files
-from touchgoal.episodes.format.encoding import Description, index_columns
+from touchgoal.episodes.format.encoding import Description
 from touchgoal.episodes.format.set_files import Row
 from touchgoal.episodes.format.statistics import Stats, array_statistics, merge
+from touchgoal.episodes.schema import INDEX_DTYPES
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
@@ -79,17 +82,21 @@ class SetMetadata:
             stats = {key: merge(self.stats[key], stats[key]) for key in stats}
         return replace(self, tasks=tasks, stats=stats, files=(*full, table.combine_chunks()))
 
-    def index_columns_for(self, description: Description) -> dict[str, Any]:
-        """Return the index columns of an episode that would come next."""
-        before = self._last
+    def index_columns_for(self, description: Description) -> dict[str, Shaped[np.ndarray, " n"]]:
+        """Return LeRobot's index columns of an episode that would come next.
+
+        Time stamps are exactly frame_index / fps seconds.
+        """
+        before, frame = self._last, np.arange(description.length)
         tasks = list(dict.fromkeys((*self.tasks, description.task)))
-        return index_columns(
-            description.length,
-            self.fps,
-            episode_index=before["episode_index"] + 1 if before else 0,
-            first_index=before["dataset_to_index"] if before else 0,
-            task_index=tasks.index(description.task),
-        )
+        columns = {
+            "timestamp": frame / self.fps,
+            "frame_index": frame,
+            "episode_index": np.full_like(frame, before["episode_index"] + 1 if before else 0),
+            "index": frame + (before["dataset_to_index"] if before else 0),
+            "task_index": np.full_like(frame, tasks.index(description.task)),
+        }
+        return {key: columns[key].astype(dtype) for key, dtype in INDEX_DTYPES.items()}
 
     def _check_same(self, description: Description) -> None:
         if description.fps != self.fps:
@@ -97,13 +104,7 @@ class SetMetadata:
                 f"this set runs at {self.fps} frames per second, the episode at {description.fps}: "
                 "record it into another folder"
             )
-        ours, theirs = self.features, description.features
-        differing = sorted(
-            key
-            for key in {*ours, *theirs}
-            if dtype_and_shape(ours.get(key)) != dtype_and_shape(theirs.get(key))
-        )
-        if differing:
+        if differing := differing_features(self.features, description.features):
             raise UserError(
                 f"this set has other features than the episode ({', '.join(differing)} differ in "
                 "presence or shape): record it into another folder"
@@ -221,9 +222,13 @@ def _json(value: Any) -> bytes:
     return json.dumps(value, indent=1, allow_nan=False).encode()
 
 
-def dtype_and_shape(feature: dict[str, Any] | None) -> Any:
-    """Return what must be equal of a feature in two sets that are to be one; None if absent."""
-    return feature and (feature["dtype"], feature["shape"])
+def differing_features(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]:
+    """Return the keys that only one of two sets has, or whose dtype or shape differ."""
+    first, second = (
+        {key: (feature["dtype"], feature["shape"]) for key, feature in features.items()}
+        for features in (ours, theirs)
+    )
+    return sorted(key for key in {*ours, *theirs} if first.get(key) != second.get(key))
 
 
 def _with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:

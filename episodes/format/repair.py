@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import Description, read_description, write_tables
+from touchgoal.episodes.format.episode_table import rows_of
 from touchgoal.episodes.format.foreign import foreign_data_file, foreign_file, refusal
 from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.runtime.atomic_write import atomic_write
@@ -23,7 +24,7 @@ from touchgoal.runtime.progress import track
 REPAIRED = "repaired"
 _FOLDERS = ("data", "videos", "meta")
 _META = (set_files.INFO, set_files.EPISODES, set_files.TASKS, set_files.STATS)
-_ROWS = 100  # compared at a time
+
 _DATA_FILES = "chunk-[0-9][0-9][0-9]/file-[0-9][0-9][0-9].parquet"
 
 
@@ -131,11 +132,9 @@ def _altered_meta(root: Path, found: SetMetadata, rebuilt: SetMetadata) -> list[
 
 
 def _rows(set_metadata: SetMetadata) -> Iterator[set_files.Row]:
-    """Yield the rows of all files of meta/episodes, in order."""
-    for table in set_metadata.files:
-        names = [name for name in table.column_names if not name.startswith("meta/episodes/")]
-        for batch in table.select(names).to_batches(max_chunksize=_ROWS):
-            yield from batch.to_pylist()
+    """Yield the rows of meta/episodes but for the file of each."""
+    for row in rows_of(set_metadata.files):
+        yield {key: v for key, v in row.items() if not key.startswith("meta/episodes/")}
 
 
 def repair(root: str | os.PathLike[str]) -> list[str]:
