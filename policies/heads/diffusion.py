@@ -39,10 +39,10 @@ def add_noise(
     added = noise.randn(clean.shape).to(clean)
     if config.kind == "flow":
         time = noise.rand((b,)).to(clean)
-        t = _broadcast(time, clean)
+        t = time[:, None, None]
         return (1 - t) * added + t * clean, FLOW_TIME_SCALE * time, clean
     step = noise.randint(config.num_train_timesteps, (b,))
-    power = _broadcast(alphas_cumprod(config.num_train_timesteps)[step].to(clean), clean)
+    power = alphas_cumprod(config.num_train_timesteps)[step].to(clean)[:, None, None]
     noisy = power.sqrt() * clean + (1 - power).sqrt() * added
     return noisy, step.to(clean), added if config.prediction_type == "epsilon" else clean
 
@@ -60,25 +60,13 @@ def denoise(
         noise: standard normal.
         generator: of the noise that "ddpm" adds, on the CPU.
     """
-    walk = _denoise_flow if config.kind == "flow" else _denoise_diffusion
-    return walk(config, network, noise, generator)
-
-
-def _denoise_flow(
-    config: SamplerConfig, network: DenoisingNetwork, x: Tensor, generator: torch.Generator
-) -> Tensor:
-    n = config.num_inference_steps
-    for i in range(n):
-        clean = network(x, x.new_full((len(x),), FLOW_TIME_SCALE * i / n))
-        x = x + (clean.clamp(-config.clip, config.clip) - x) / (n - i)
-    return x
-
-
-def _denoise_diffusion(
-    config: SamplerConfig, network: DenoisingNetwork, x: Tensor, generator: torch.Generator
-) -> Tensor:
+    x, count = noise, config.num_inference_steps
+    if config.kind == "flow":
+        for i in range(count):
+            clean = network(x, x.new_full((len(x),), FLOW_TIME_SCALE * i / count))
+            x = x + (clean.clamp(-config.clip, config.clip) - x) / (count - i)
+        return x
     # "trailing", from pure noise on (Lin et al. 2024)
-    count = config.num_inference_steps
     share = torch.arange(count, 0, -1, dtype=torch.float64) / count
     steps = ((share * config.num_train_timesteps).round().long() - 1).tolist()
     powers = alphas_cumprod(config.num_train_timesteps)[steps].tolist()
@@ -96,10 +84,6 @@ def _denoise_diffusion(
         if fresh > 0:
             x = x + fresh * torch.randn(x.shape, generator=generator).to(x)
     return x
-
-
-def _broadcast(values: Float[Tensor, " b"], like: Float[Tensor, "b h a"]) -> Tensor:
-    return values.reshape(-1, *[1] * (like.ndim - 1))
 
 
 @dataclass(frozen=True)
@@ -166,15 +150,12 @@ class Regression(nn.Module):
         is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
         """Return the mean absolute error without padded ticks; nothing is random."""
-        return masked_mean((self._predict(condition) - chunk).abs(), is_pad)
+        return masked_mean((self.sample(condition) - chunk).abs(), is_pad)
 
     def sample(
-        self, condition: Float[Tensor, "b c"], generator: torch.Generator
+        self, condition: Float[Tensor, "b c"], generator: torch.Generator | None = None
     ) -> Float[Tensor, "b h a"]:
         """Predict the chunk for every condition; nothing is random."""
-        return self._predict(condition)
-
-    def _predict(self, condition: Float[Tensor, "b c"]) -> Float[Tensor, "b h a"]:
         return self.network(condition).unflatten(1, self._shape)
 
 
