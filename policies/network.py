@@ -226,13 +226,14 @@ class PolicyNetwork(nn.Module):
         """
         pose, key_pose_loss = None, torch.zeros((), device=actions.device)
         if self.key_pose:
-            assert batch.maps is not None and key_pose is not None, "needs maps and key poses"
-            hand = self._hand(batch.state[:, -1])
-            key_pose_loss = self.key_pose.loss(batch.maps.float(), hand, key_pose[:, 1:])
+            assert key_pose is not None, "needs key poses"
+            maps, hand = self.seen(batch)
+            key_pose_loss = self.key_pose.loss(maps, hand, key_pose[:, 1:])
             pose = kp.true_pose(hand[:, :7], key_pose)
             draws = 1 if self.end_to_end_encoder else _DRAWS
             rows = batch.touch, batch.state, batch.images, pose, actions, wrench, action_is_pad
-            touch, state, images, pose, actions, wrench, action_is_pad = _repeated(rows, draws)
+            again: list[Any] = [None if x is None else x.repeat_interleave(draws, 0) for x in rows]
+            touch, state, images, pose, actions, wrench, action_is_pad = again
             batch = ObservationBatch(touch, state, images)
         chunk = to_representation(actions, batch.joints, self.config.representation)
         if pose is not None and self.config.representation == "body_twist":
@@ -248,22 +249,12 @@ class PolicyNetwork(nn.Module):
         loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
         return loss + wrench_loss + key_pose_loss
 
-    @torch.no_grad()
-    def key_pose_error(
-        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]
-    ) -> Float[Tensor, "b 2"]:
-        """Return the position errors of the next two estimated key poses, m."""
-        assert self.key_pose and batch.maps is not None, "needs cameras"
-        hand = self._hand(batch.state[:, -1])
-        return self.key_pose.error(batch.maps.float(), hand, key_pose[:, 1:])
-
-    def calibrate_key_poses(
-        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]
-    ) -> None:
-        """Scale the cameras' expected errors to the actual ones on validation episodes."""
-        assert self.key_pose and batch.maps is not None, "needs cameras"
-        hand = self._hand(batch.state[:, -1])
-        self.key_pose.calibrate(batch.maps.float(), hand, key_pose[:, 1:])
+    def seen(
+        self, batch: ObservationBatch
+    ) -> tuple[Float[Tensor, "b k c y x"], Float[Tensor, "b 8"]]:
+        """Return what a `KeyPoseReadout` takes at the latest tick: feature maps, and the hand."""
+        assert batch.maps is not None, "needs the cameras' feature maps"
+        return batch.maps.float(), self._hand(batch.state[:, -1])
 
     def _hand(self, state: Float[Tensor, "b s"]) -> Float[Tensor, "b 8"]:
         """Return the TCP's pose and the gripper's width."""
@@ -291,7 +282,8 @@ class PolicyNetwork(nn.Module):
             pose = kp.true_pose(self._hand(batch.state[:, -1])[:, :7], key_pose)
         elif self.key_pose:
             assert average is not None, "needs the episode's average, or the true key poses"
-            pose = self._estimate(batch, average)
+            maps, hand = self.seen(batch)
+            pose = average.add(*self.key_pose(maps, hand), hand[:, :7])
         encoded = self._encode(batch, self._encode_touch(batch), pose)
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)
@@ -302,13 +294,6 @@ class PolicyNetwork(nn.Module):
                 planned = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)
                 actions[..., -1] = width if keeps else planned
         return actions
-
-    def _estimate(self, batch: ObservationBatch, average: KeyPoseAverage) -> Float[Tensor, "b 11"]:
-        """Add the cameras' estimates to the average; return it as from `true_pose`."""
-        assert self.key_pose and batch.maps is not None, "needs the cameras' feature maps"
-        hand = self._hand(batch.state[:, -1])
-        estimate, weight = self.key_pose(batch.maps.float(), hand)
-        return average.add(estimate, weight, hand[:, :7])
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None
@@ -347,8 +332,3 @@ class PolicyNetwork(nn.Module):
         if pose is not None:
             parts.append(kp.features(pose, noise))
         return torch.cat(parts, 1)
-
-
-def _repeated(tensors: Sequence[Tensor | None], times: int) -> list[Any]:
-    """Return tensors with every row repeated, those that are None as they are."""
-    return [None if x is None else x.repeat_interleave(times, 0) for x in tensors]

@@ -34,9 +34,11 @@ def estimate_from(frame: Float[Tensor, "b 7"], pose: Float[Tensor, "b 7"]) -> Fl
     """Express a pose as an estimate in `frame`; both are poses in the base frame."""
     axes = _axes(frame)
     there = axes.mT @ _axes(pose)
-    turn = _reference(there[:, :, 2]).mT @ there
+    turn = _reference(there[:, :, 2]).mT @ there  # about z
+    once = torch.complex(turn[:, 0, 0], turn[:, 1, 0])
+    multiples = torch.view_as_real(torch.stack([once**2, once**4], 1)).flatten(1)
     place = ((pose[:, :3] - frame[:, :3])[:, None] @ axes)[:, 0]
-    return torch.cat([place, there[:, :, 2], _multiples(turn)], 1)
+    return torch.cat([place, there[:, :, 2], multiples], 1)
 
 
 def to_frame(
@@ -71,12 +73,6 @@ def _turns() -> tuple[Float[Tensor, " t"], Float[Tensor, "4 t"]]:
     """Return turns of up to a quarter turn either way, rad, with cosines and sines of their multiples."""
     turns = (torch.arange(_DEGREES) - _DEGREES / 2 + 0.5) * math.pi / _DEGREES
     return turns, torch.stack([f(n * turns) for n in (2, 4) for f in (torch.cos, torch.sin)])
-
-
-def _multiples(turn: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 4"]:
-    """Return cosine and sine of twice and four times the angle of rotations about z."""
-    once = torch.complex(turn[:, 0, 0], turn[:, 1, 0])
-    return torch.view_as_real(torch.stack([once**2, once**4], 1)).flatten(1)
 
 
 def _reference(approach: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:

@@ -100,11 +100,6 @@ class ImageReadout(nn.Module):
             nn.Conv2d(config.hidden, config.keypoints, 1),
         )
 
-    @staticmethod
-    def width(config: ImageInputConfig) -> int:
-        """Return the width of the output."""
-        return 2 * config.keypoints
-
     def fit(self, maps: Float16[Tensor, "n c y x"]) -> None:
         """Fit mean and standard deviation of each channel to training data."""
         sample = maps[:: max(1, len(maps) // 512)].float()

@@ -37,7 +37,7 @@ class CameraReadout(nn.Module):
         super().__init__()
         self.place_images, self.turn_images = ImageReadout(config), ImageReadout(config)
         self.normalizer = Normalizer((_PLACE,))
-        width = ImageReadout.width(config) + 2
+        width = 2 * config.keypoints + 2
         turns, turn_groups = ESTIMATE_DIM - _PLACE, len(GROUPS) - _PLACE_GROUPS
         self.places = readout(width, 128, COUNT * (_PLACE + _PLACE_GROUPS + 1))
         self.turns = readout(width, 128, COUNT * (turns + turn_groups))

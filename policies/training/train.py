@@ -63,7 +63,7 @@ def train(
             folders.append(out_dir / SNAPSHOTS / f"epoch-{len(history):04d}")
         if folders and averaged.key_pose:
             batch = _validation_batch(averaged, validation)
-            averaged.calibrate_key_poses(_observed(batch), batch["key_pose"])
+            averaged.key_pose.calibrate(*averaged.seen(_observed(batch)), batch["key_pose"][:, 1:])
         for folder in folders:
             on_first_process(partial(checkpoint.save, averaged, folder, provenance | known))
 
@@ -174,8 +174,8 @@ def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dic
     error = off.sum(1).norm(dim=1).mean()
     loss = PolicyLoss(policy)(**batch, noise=BatchNoise(generator))["loss"]
     metrics = {"validation_loss": loss.item(), "validation_error": error.item()}
-    if batch["key_pose"] is not None:
-        off = policy.key_pose_error(observed, batch["key_pose"])
+    if policy.key_pose:
+        off = policy.key_pose.error(*policy.seen(observed), batch["key_pose"][:, 1:])
         metrics["validation_key_pose_error"] = off[:, 0].median().item()
     return metrics
 
