@@ -16,7 +16,7 @@ from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.policies.config import Box, PoseEstimatorConfig, PoseTrainConfig
 from touchgoal.policies.perception.placements import Placements
-from touchgoal.policies.perception.pose_estimator import Look, PoseEstimator, evenly_lit
+from touchgoal.policies.perception.pose_estimator import PoseEstimator, evenly_lit
 from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
 
 _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose counts linearly
@@ -180,12 +180,13 @@ def fit_trust(
     """
     sure, good, second, named = [], [], [], []
     for rows, target, words in _targets(placements):
-        found, true = _look(estimator, placements, rows, words), placements.start[rows, target]
-        sure.append(found.sureness)
-        second.append(found.second[:, 0])
+        start, sureness, others = _look(estimator, placements, rows, words)
+        true = placements.start[rows, target]
+        sure.append(sureness)
+        second.append(others[:, 0])
         named.append(words.any(1))
-        off = (found.start - true)[:, :2].norm(dim=1)
-        good.append((off < _BAD[0]) & (_yaw_error(found.start, true) < _BAD[1]))
+        off = (start - true)[:, :2].norm(dim=1)
+        good.append((off < _BAD[0]) & (_yaw_error(start, true) < _BAD[1]))
     shares, fine = torch.cat(sure), torch.cat(good)
     others, said = torch.cat(second), torch.cat(named)
     if not (fine & said).any() or not (fine & ~said).any():  # without good estimates, no threshold
@@ -209,8 +210,22 @@ def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, d
     """
     errors = {}
     for rows, target, words in _targets(placements):
-        others = int(placements.objects[rows[0]]) - 1
-        errors[f"{others} others"] = _errors(estimator, placements, rows, target, words)
+        predicted, _, _ = _look(estimator, placements, rows, words)
+        true = placements.start[rows, target]
+        off = predicted - true
+        away = 1e3 * off[:, :2].norm(dim=1)
+        by_name = {
+            "object_mm": away,
+            "goal_mm": 1e3 * off[:, 5:].norm(dim=1),
+            "height_mm": 1e3 * off[:, 2].abs(),
+            # round objects are grasped at 0 exactly
+            "yaw_degrees": _yaw_error(predicted, true)[true[:, 4] != 0],
+        }
+        at = torch.tensor([0.5, 0.9])
+        found = {"count": len(rows), "found": (away < 30).float().mean().item()}
+        errors[f"{int(placements.objects[rows[0]]) - 1} others"] = found | {
+            name: error.quantile(at).tolist() for name, error in by_name.items() if len(error)
+        }
     return errors
 
 
@@ -240,47 +255,22 @@ def _look(
     placements: Placements,
     rows: Int64[Tensor, " n"],
     words: Float[Tensor, "n d"],
-) -> Look:
+) -> tuple[Float[Tensor, "n 7"], Float[Tensor, "n 4"], Float[Tensor, "n 2"]]:
+    """Return `start`, `sureness` and `second` of each `Look`."""
     looks = []
     for some, chosen in zip(rows.split(_BATCH), words.split(_BATCH), strict=True):
         lit = evenly_lit({key: images[some] for key, images in placements.images.items()})
         scene = estimator.scene(lit, placements.tcp[some], placements.shift[some])
-        looks.append(estimator.look(lit, chosen, scene))
-    names = ("start", "found", "turned", "unmirrored", "second")
-    joined = {name: torch.cat([getattr(o, name) for o in looks]) for name in names}
-    places = {key: torch.cat([o.places[key] for o in looks]) for key in looks[0].places}
-    return Look(places=places, **joined)
+        look = estimator.look(lit, chosen, scene)
+        looks.append((look.start, look.sureness, look.second))
+    start, sureness, second = (torch.cat(parts) for parts in zip(*looks, strict=True))
+    return start, sureness, second
 
 
 def _yaw_error(predicted: Float[Tensor, "n 7"], true: Float[Tensor, "n 7"]) -> Float[Tensor, " n"]:
     """Return the errors of the grasp's yaw, degrees."""
     twice = torch.atan2(predicted[:, 4], predicted[:, 3]) - torch.atan2(true[:, 4], true[:, 3])
     return torch.rad2deg(torch.atan2(twice.sin(), twice.cos()) / 2).abs()
-
-
-def _errors(
-    estimator: PoseEstimator,
-    placements: Placements,
-    rows: Int64[Tensor, " n"],
-    target: Int64[Tensor, " n"],
-    words: Float[Tensor, "n d"],
-) -> dict[str, Any]:
-    predicted = _look(estimator, placements, rows, words).start
-    true = placements.start[rows, target]
-    off = predicted - true
-    away = 1e3 * off[:, :2].norm(dim=1)
-    errors = {
-        "object_mm": away,
-        "goal_mm": 1e3 * off[:, 5:].norm(dim=1),
-        "height_mm": 1e3 * off[:, 2].abs(),
-        # round objects are grasped at 0 exactly
-        "yaw_degrees": _yaw_error(predicted, true)[true[:, 4] != 0],
-    }
-    at = torch.tensor([0.5, 0.9])
-    found = {"count": len(rows), "found": (away < 30).float().mean().item()}
-    return found | {
-        name: error.quantile(at).tolist() for name, error in errors.items() if len(error)
-    }
 
 
 def error_table(errors: dict[str, dict[str, Any]]) -> str:

@@ -118,7 +118,7 @@ class StateEstimator:
             raise RefusedError(
                 f"several objects may be {meant}: say which one, so that it fits no other (--target)"
             )
-        self._start = self._latest = _pose(look)
+        self._start = self._latest = _unit_yaw(look.start[0].numpy())
         self._check_camera(look, first)
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
         self._first, self._touched = first, False
@@ -130,24 +130,14 @@ class StateEstimator:
         The camera's pose is taken from the first images, in which nothing moves.
         """
         look = self.pose_estimator.look(self._images(observation), self._words, self._scene)
-        if any(
-            sure < least for sure, least in zip(look.sureness[0].tolist(), self._least, strict=True)
-        ):
+        if np.less(look.sureness[0].numpy(), self._least).any():
             return
-        now, before = _pose(look), self._latest
+        now, before = _unit_yaw(look.start[0].numpy()), self._latest
         self._latest = now
         moved = np.linalg.norm(now[:2] - self._start[:2]) > _MOVED
         if moved and np.linalg.norm(now[:2] - before[:2]) < _AGREE:
             object_ = _unit_yaw((now + before) / 2)[:_OBJECT]
             self._start = np.concatenate([object_, self._start[_OBJECT:]])
-
-    def _projected(self, view: UsualView, look: Look) -> Float32[np.ndarray, "4"]:
-        """Return places of object and goal, x and y (m), by where they are in the image."""
-        seen = look.places[ft.FRONT][0].numpy().astype(np.float64)
-        object_, goal = (
-            view.place(*pair) for pair in zip(seen, (float(look.start[0, 2]), 0.0), strict=True)
-        )
-        return np.concatenate([object_, goal]).astype(np.float32)
 
     def _check_camera(self, look: Look, first: Mapping[str, np.ndarray]) -> None:
         """Refuse a first look at the edge of the image, or that the calibrated camera sees elsewhere."""
@@ -159,7 +149,9 @@ class StateEstimator:
                 "object or disc lie at the edge of what the camera sees: turn it so that all of the "
                 "table is in view, and calibrate it anew (calibrate-camera)"
             )
-        apart = (self._projected(view, look) - self._start[_PLACES]).reshape(2, 2)
+        heights = float(look.start[0, 2]), 0.0
+        projected = [view.place(*pair) for pair in zip(seen, heights, strict=True)]
+        apart = np.array(projected, np.float32) - self._start[_PLACES].reshape(2, 2)
         if (far := np.linalg.norm(apart, axis=1).max()) > _APART:
             raise RefusedError(
                 f"object or disc are {1e3 * far:.0f} mm from where the calibrated camera sees them: "
@@ -194,12 +186,8 @@ class StateEstimator:
         return evenly_lit(images)
 
 
-def _pose(look: Look) -> Float32[np.ndarray, "7"]:
-    """Return `features.TRUTH_START` as a policy knows it, with a yaw of length 1."""
-    return _unit_yaw(look.start[0].numpy())
-
-
 def _unit_yaw(start: Float32[np.ndarray, "7"]) -> Float32[np.ndarray, "7"]:
+    """Return `features.TRUTH_START` as a policy knows it, with a yaw of length 1."""
     unit = start.copy()
     unit[_YAW] /= max(float(np.linalg.norm(unit[_YAW])), 1e-6)
     return unit
