@@ -30,7 +30,7 @@ from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.evaluation.evaluate import trial_specs
-from touchgoal.policies.training.improve import Acting
+from touchgoal.policies.training.improve import acts_alone
 from touchgoal.policies.training.model_selection import copy_parts
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import POLICY, train
@@ -183,7 +183,7 @@ def _policy_runs(
     env = replace(_ENV, objects=HELD_OUT_OBJECTS, camera_size=size)
     specs, root = trial_specs(env, count, _POLICY_SEED), folder / "episodes"
     if missing := missing_specs(root, specs):
-        collect(root, env, missing, workers, Acting(partial(_act, policy)))
+        collect(root, env, missing, workers, partial(acts_alone, partial(_act, policy)))
     return list(_as_recorded(root))
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import partial
-from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -37,7 +36,8 @@ def embed_episodes(
 
     A kill loses those in progress.
     """
-    missing = [i for i in chosen if not _cache_path(episodes, embedder, i).exists()]
+    paths = {i: embedding_file(episodes, i, embedder.name, ".npy") for i in chosen}
+    missing = [i for i, path in paths.items() if not path.exists()]
     embed = partial(embed_episode, episodes, embedder)
     with (
         nullcontext(map(embed, missing))
@@ -46,8 +46,7 @@ def embed_episodes(
     ):
         counted = track(embedded, "embedding", "episode", total=len(missing)) if missing else ()
         for i, rows in zip(missing, counted, strict=True):
-            path = _cache_path(episodes, embedder, i)
-            with atomic_write(path) as unfinished, unfinished.open("wb") as file:
+            with atomic_write(paths[i]) as unfinished, unfinished.open("wb") as file:
                 np.save(file, rows)
     return [cached_embeddings(episodes, i, embedder) for i in chosen]
 
@@ -56,15 +55,11 @@ def cached_embeddings(
     episodes: EpisodeSet, i: int, embedder: Embedder
 ) -> Float16[np.ndarray, "t ..."]:
     """Return the cached embeddings of an episode; UserError if they are damaged."""
-    path = _cache_path(episodes, embedder, i)
+    path = embedding_file(episodes, i, embedder.name, ".npy")
     rows = np.load(path)
     if rows.shape != (episodes.lengths[i], *embedder.shape):
         raise UserError(f"{path} is damaged: delete {path.parent}, which is made again")
     return rows
-
-
-def _cache_path(episodes: EpisodeSet, embedder: Embedder, i: int) -> Path:
-    return embedding_file(episodes, i, embedder.name, ".npy")
 
 
 def embed_episode(episodes: EpisodeSet, embedder: Embedder, i: int) -> Float16[np.ndarray, "t ..."]:

@@ -8,6 +8,7 @@ a simulator knows: success ends no run and chooses nothing; it is printed beside
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -134,16 +135,10 @@ def plot_rounds(rounds: Sequence[Round]) -> Figure:
     return figure
 
 
-@dataclass(frozen=True)
-class Acting:
-    """A policy whose own actions are recorded, see `Roles` in `episodes/recording.py`."""
-
-    make: Callable[[Any], Actor]
-
-    def __call__(self, env: Any, spec: EpisodeSpec) -> tuple[Actor, Actor]:
-        """Return the policy in both roles."""
-        actor = self.make(env)
-        return actor, actor
+def acts_alone(make: Callable[[Any], Actor], env: Any, spec: EpisodeSpec) -> tuple[Actor, Actor]:
+    """Return a policy in both `Roles` of `episodes/recording.py`: its own actions are recorded."""
+    actor = make(env)
+    return actor, actor
 
 
 def record_simulated(
@@ -152,7 +147,7 @@ def record_simulated(
     """Record runs of a policy in simulation, for an `Improvement`."""
     options, first = env.reset_options(), seeds.IMPROVEMENT.start
     specs = [EpisodeSpec(first + i, options=options[i % len(options)]) for i in numbers]
-    collect(root, env, specs, workers, Acting(choose_policy(policy, env)[0]))
+    collect(root, env, specs, workers, partial(acts_alone, choose_policy(policy, env)[0]))
 
 
 def simulation_of(demonstrations: EpisodeSet) -> TaskConfig | None:

@@ -25,11 +25,8 @@ def select(
     scores: dict[str, Score] = {}
     for snapshot in sorted((run / SNAPSHOTS).iterdir()):
         copy_parts(snapshot, parts)
-        scores[snapshot.name] = trial(snapshot)
-        print(
-            f"{snapshot.name}: success {scores[snapshot.name][0]:.0%}, "
-            f"progress {scores[snapshot.name][1]:.0%}"
-        )
+        success, progress = scores[snapshot.name] = trial(snapshot)
+        print(f"{snapshot.name}: success {success:.0%}, progress {progress:.0%}")
     best = max(scores, key=lambda name: (scores[name], name))
     shutil.rmtree(run / POLICY, ignore_errors=True)
     shutil.copytree(run / SNAPSHOTS / best, run / POLICY)

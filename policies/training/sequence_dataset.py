@@ -109,7 +109,8 @@ def _check(
             "control_hz to the episodes' rate"
         )
     check_arm(episodes)
-    if missing := set(config.proprioception) - set(episodes.features):
+    reads = {*config.proprioception, *(config.images.cameras if config.images else ())}
+    if missing := reads - set(episodes.features):
         raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy reads")
     if config.reads_wrench and ft.TRUTH_PAD_WRENCH not in episodes.features:
         raise UserError(
@@ -122,8 +123,6 @@ def _check(
             f"the policy needs touch {config.touch!r} of width {config.touch_dim}, this is "
             f"{made[0]!r} of width {made[1]}: make its config for this embedder"
         )
-    if config.images and (missing := set(config.images.cameras) - set(episodes.features)):
-        raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy reads")
     if embedder or config.end_to_end:
         check_fingertips(episodes, chosen)
 

@@ -10,7 +10,6 @@ from touchgoal.control import features as ft
 from touchgoal.episodes.faults import leave_out_faulty
 from touchgoal.episodes.outcomes.judged import read_judged
 from touchgoal.episodes.recording import CORRECTED
-from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.training.action_meaning import ActionMeaning, joint_changes
 from touchgoal.runtime.errors import UserError
@@ -78,27 +77,24 @@ def choose_judged(episodes: EpisodeSet) -> ChosenEpisodes:
     return ChosenEpisodes(rows, verdicts.count("failure"), unsure=verdicts.count("unsure"))
 
 
-def leading_pause(episode: Episode, meaning: ActionMeaning = "change") -> int:
-    """Return how many frames pass before an episode's arm or gripper moves or is commanded to.
-
-    An episode without motion has no start to trim to: 0. Needs state and action.
-    """
-    state = episode.frames[ft.STATE]
-    action = joint_changes(episode.frames[ft.ACTION], state, meaning)
-    joints = action.shape[1] - 1
-    commanded = np.abs(np.cumsum(action[:, :joints], axis=0)).max(1) > _JOINT_MOTION
-    commanded |= np.abs(action[:, -1] - action[0, -1]) > _WIDTH_MOTION
-    moved = np.abs(state[:, :joints] - state[0, :joints]).max(1) > _JOINT_MOTION
-    moved |= np.abs(state[:, -1] - state[0, -1]) > _WIDTH_MOTION
-    moving = np.flatnonzero(commanded | moved)
-    return int(moving[0]) if len(moving) else 0
-
-
 def find_pauses(
     episodes: EpisodeSet, rows: Sequence[int], meaning: ActionMeaning = "change"
 ) -> list[int]:
-    """Return how many frames of each episode pass before arm or gripper first move."""
-    return [leading_pause(episodes.read(i, [ft.STATE, ft.ACTION]), meaning) for i in rows]
+    """Return how many frames of each episode pass before arm or gripper moves or is commanded to.
+
+    An episode without motion has no start to trim to: 0.
+    """
+    pauses = []
+    for i in rows:
+        state, action = episodes.read(i, [ft.STATE, ft.ACTION]).frames.values()
+        action = joint_changes(action, state, meaning)
+        joints = action.shape[1] - 1
+        moving = np.abs(np.cumsum(action[:, :joints], axis=0)).max(1) > _JOINT_MOTION
+        moving |= np.abs(action[:, -1] - action[0, -1]) > _WIDTH_MOTION
+        moving |= np.abs(state[:, :joints] - state[0, :joints]).max(1) > _JOINT_MOTION
+        moving |= np.abs(state[:, -1] - state[0, -1]) > _WIDTH_MOTION
+        pauses.append(int(np.argmax(moving)))  # 0, too, where nothing moves
+    return pauses
 
 
 def report_pauses(pauses: Sequence[int], fps: int, trimmed: bool) -> None:
@@ -119,7 +115,7 @@ def find_task(chosen: Sequence[tuple[EpisodeSet, Sequence[int]]], task: str | No
 
     UserError: they are of several tasks or of another one, or name none and `task` is None.
     """
-    root, found = chosen[0][0].root, _common("task", chosen, lambda meta: str(meta.get("task", "")))
+    root, found = chosen[0][0].root, _common("task", chosen)
     if task and found not in ("", task):
         raise UserError(f"{root} is of {found}, not of {task}: leave out --task")
     if not (found or task):
@@ -145,11 +141,11 @@ def succeeded(meta: Mapping[str, Any]) -> bool | None:
 
 def common_sensor(sets: Sequence[tuple[EpisodeSet, Sequence[int]]]) -> str:
     """Return the fingertip sensor of the episodes, "" if none is named; UserError if several."""
-    return _common("sensor", sets, lambda meta: str(meta.get("sensor", "")))
+    return _common("sensor", sets)
 
 
-def _common(what: str, sets: Sequence[tuple[EpisodeSet, Sequence[int]]], fact: Any) -> str:
-    found = {fact(s.meta(i)): s.root for s, rows in sets for i in rows}
+def _common(what: str, sets: Sequence[tuple[EpisodeSet, Sequence[int]]]) -> str:
+    found = {str(s.meta(i).get(what, "")): s.root for s, rows in sets for i in rows}
     if len(found) > 1:
         kinds = "; ".join(f"{name or 'unknown'} in {root}" for name, root in found.items())
         raise UserError(
