@@ -230,13 +230,11 @@ class LearnedPolicy(Planner):
         return self._maps[1]
 
     def _difference_images(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
-        end_to_end = self.config.end_to_end
-        if end_to_end is None:
+        if self.config.end_to_end is None:
             return None
-        images = [
-            difference_images(observation[k][None], self._first[k], end_to_end.size)
-            for k in ft.TACTILE
-        ]
+        pairs = [(observation[k], self._first[k]) for k in ft.TACTILE]
+        size = self.config.end_to_end.size
+        images = [difference_images(image[None], first, size) for image, first in pairs]
         return torch.from_numpy(np.stack(images, 1))
 
     def env_config(self, task: Task | None = None, name: str = "") -> Task:

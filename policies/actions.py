@@ -103,13 +103,9 @@ class Normalizer(nn.Module):
     A constant component becomes 0, and comes back as the constant.
     """
 
-    offset: Tensor
-    scale: Tensor
-
     def __init__(self, shape: tuple[int, ...]) -> None:
         super().__init__()
-        self.register_buffer("offset", torch.zeros(shape))
-        self.register_buffer("scale", torch.ones(shape))
+        self.offset, self.scale = nn.Buffer(torch.zeros(shape)), nn.Buffer(torch.ones(shape))
 
     def fit_range(
         self,

@@ -11,10 +11,7 @@ from touchgoal.control.safety.limits import FRANKA_HAND
 
 _EMPTY = 0.004  # m: fingers that near to each other hold nothing
 _CONFIRMING = 0.3  # s for which they must be, or for which a held object keeps the fingers apart
-_STILL, _CLOSED_IN = (
-    1e-3,
-    8e-3,
-)  # m by which a held object's width changes; by which a lost one's does
+_STILL, _CLOSED_IN = 1e-3, 8e-3  # m by which a held object's width changes; a lost one's does
 _SPEED = 0.6  # rad/s of the fastest joint on the way back
 _BACK = 0.02  # rad from where the hand began: it is back
 _TRIES = 2  # after the first

@@ -112,7 +112,11 @@ def evaluate(
     """
     if episodes < 1 or workers < 1:
         raise UserError("evaluate needs at least one episode and one worker")
-    maker, config = prepare_policy(policy, _task_config(task), target)
+    if isinstance(task, str):
+        if task not in ENVS:
+            raise unknown_name("task", task, ENVS)
+        task = ENVS[task]
+    maker, config = prepare_policy(policy, task, target)
     return Evaluation(
         tuple(run_trials(config, maker, trial_specs(config, episodes, seed), workers))
     )
@@ -193,11 +197,3 @@ def run_trial(
         )
     finally:
         env.close()
-
-
-def _task_config(task: str | TaskConfig) -> TaskConfig:
-    if not isinstance(task, str):
-        return task
-    if task not in ENVS:
-        raise unknown_name("task", task, ENVS)
-    return ENVS[task]
