@@ -9,15 +9,13 @@ import sys
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from touchgoal.control.cell.config import CellConfig
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
-
-if TYPE_CHECKING:
-    from touchgoal.control.cell.config import CellConfig
 
 _STOPPED = 4  # exit status
 
@@ -56,7 +54,7 @@ def main(config: Config) -> None:
         _move(config.action, cell)
 
 
-def _recover(cell: "CellConfig") -> None:
+def _recover(cell: CellConfig) -> None:
     from touchgoal.control import features as ft
     from touchgoal.control.cell.connection import connect_arm
 
@@ -66,7 +64,7 @@ def _recover(cell: "CellConfig") -> None:
     print("recovered: the arm takes commands")
 
 
-def _move(move: str, cell: "CellConfig") -> None:
+def _move(move: str, cell: CellConfig) -> None:
     import numpy as np
 
     from touchgoal.control.deployment.control_loop import PLAN_ENDED

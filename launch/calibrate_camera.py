@@ -7,6 +7,7 @@ table, for the front camera fix it to the hand, flat. Take 15 views and more: ch
 
 import json
 import sys
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,16 +16,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from pydantic import Field
 
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.hand_eye.board import Board
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.option_types import Positive, checked_dataclass
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from touchgoal.control.cell.config import CellConfig
     from touchgoal.control.cell.connection import CellConnection
-    from touchgoal.control.hand_eye.board import Board
     from touchgoal.control.hand_eye.solve import HandEye, View
 
 Side = Annotated[int, Field(ge=3, le=10)]
@@ -55,8 +54,6 @@ class Config:
 
 def main(config: Config) -> None:
     """Print the board; or take views, calibrate, report and write the cell file."""
-    from touchgoal.control.hand_eye.board import Board
-
     board = Board(*config.squares, 1e-3 * config.square_mm)
     if config.board is not None:
         board.print_to(config.board)
@@ -67,11 +64,12 @@ def main(config: Config) -> None:
         _calibrate(config, config.cell, board)
 
 
-def _calibrate(config: Config, path: Path, board: "Board") -> None:
+def _calibrate(config: Config, path: Path, board: Board) -> None:
     from touchgoal.control.cell.cell_file import read_cell_file
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.control.hand_eye.solve import calibrate_camera
     from touchgoal.launch.support.cell_run import confirm, connect
+    from touchgoal.runtime.image_file import write_image
     from touchgoal.runtime.run_folder import open_run
 
     cell = read_cell_file(path)
@@ -84,13 +82,15 @@ def _calibrate(config: Config, path: Path, board: "Board") -> None:
     out = open_run(config.out, "calibrate-camera", config)
     with closing(connect(cell, new_episode=False)) as connection:
         views = list(_views(config, cell, connection, board))
-    _save_views(views, out)
+    for i, view in enumerate(views):
+        write_image(out / f"view_{i:02d}.png", view.image)
+    write_json(out / "joints.json", [view.q.tolist() for view in views])
     result = calibrate_camera(views, connection.robot.arm, on_hand=config.camera == "wrist")
     _report(result, config, path, out, rows=views[0].image.shape[0])
 
 
 def _views(
-    config: Config, cell: "CellConfig", connection: "CellConnection", board: "Board"
+    config: Config, cell: CellConfig, connection: "CellConnection", board: Board
 ) -> "Iterator[View]":
     """Yield the views that show the board, and say of each how much of it."""
     from touchgoal.control import features as ft
@@ -111,7 +111,7 @@ def _views(
         yield view
 
 
-def _by_hand() -> "Iterator[None]":
+def _by_hand() -> Iterator[None]:
     """Wait for Enter before each view, until q."""
     if sys.stdin is None or not sys.stdin.isatty():
         raise UserError("nobody is there to move the arm: run it in a terminal, or give --poses")
@@ -119,7 +119,7 @@ def _by_hand() -> "Iterator[None]":
         yield
 
 
-def _moved(poses: Path, cell: "CellConfig", connection: "CellConnection") -> "Iterator[None]":
+def _moved(poses: Path, cell: CellConfig, connection: "CellConnection") -> Iterator[None]:
     """Move the arm to each pose in turn; UserError if it was stopped on the way."""
     from touchgoal.control.deployment.control_loop import PLAN_ENDED
     from touchgoal.control.deployment.manual import ManualControl
@@ -147,14 +147,6 @@ def _read_poses(path: Path, n_joints: int) -> list[Any]:
     if poses.ndim != 2 or poses.shape[1] != n_joints or not np.isfinite(poses).all():
         raise UserError(f"{path} must be a list of lists of {n_joints} joint positions, rad")
     return list(poses)
-
-
-def _save_views(views: "list[View]", out: Path) -> None:
-    from touchgoal.runtime.image_file import write_image
-
-    for i, view in enumerate(views):
-        write_image(out / f"view_{i:02d}.png", view.image)
-    write_json(out / "joints.json", [view.q.tolist() for view in views])
 
 
 def _report(result: "HandEye", config: Config, cell_file: Path, out: Path, rows: int) -> None:

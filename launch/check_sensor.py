@@ -8,14 +8,12 @@ images. Leave the gel untouched for the first second, then press any object, pre
 from collections.abc import Callable
 from itertools import chain, count, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
 from touchgoal.runtime.option_types import Corners, Positive, checked_dataclass
-
-if TYPE_CHECKING:
-    from touchgoal.runtime.viewer.stream import RerunStream
+from touchgoal.runtime.viewer.stream import RerunStream, open_rerun
 
 
 @checked_dataclass
@@ -56,7 +54,6 @@ def main(config: Config) -> None:
     from touchgoal.runtime.image_file import write_image
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.run_folder import open_run
-    from touchgoal.runtime.viewer.stream import open_rerun
 
     sensor, seconds = find_sensor(config.sensor), config.seconds
     ball = config.ball_mm and config.ball_mm * 1e-3
@@ -81,7 +78,7 @@ def main(config: Config) -> None:
     print(f"presses, their change and depth: {out / 'check.png'}")
 
 
-def _shown_in(stream: "RerunStream") -> Callable[[Any, float, bool], None]:
+def _shown_in(stream: RerunStream) -> Callable[[Any, float, bool], None]:
     """Return what logs a frame; frames have no time, they are counted from 1."""
     frames = count(1)
 

@@ -7,18 +7,16 @@ judge that ships says whether it ended in success.
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from touchgoal.control.features import ACTION, CAMERAS, FRONT, TACTILE, TRUTH_CONTACT
+from touchgoal.episodes.schema import Episode
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import FIXED, Seed, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig
 
 FILMED = ("fused", "front", "object", "words")  # of the curves that the plot shows
-
-if TYPE_CHECKING:
-    from touchgoal.episodes.schema import Episode
 
 
 @checked_dataclass
@@ -82,7 +80,7 @@ def main(config: Config) -> None:
     print(f"film: {film}\ncurves: {out / 'curves.png'}\n\n{what_next(out)}")
 
 
-def until_release(episode: "Episode") -> "Episode":
+def until_release(episode: Episode) -> Episode:
     """Return the episode up to the tick at which the hand opens: placed, and still touched."""
     width = episode.frames[ACTION][:, -1]
     touched = episode.frames[TRUTH_CONTACT].max(axis=1)

@@ -8,24 +8,23 @@ stopped, by a fault or the operator.
 """
 
 import sys
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.interfaces import Planner
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
+from touchgoal.runtime.viewer.stream import BackgroundStream
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from touchgoal.control.cell.config import CellConfig
     from touchgoal.control.cell.connection import CellConnection
     from touchgoal.control.deployment.control_loop import TickStatus
     from touchgoal.control.deployment.session import Result
-    from touchgoal.control.interfaces import Planner
-    from touchgoal.runtime.viewer.stream import BackgroundStream
 
 NOT_DONE, STOPPED = 3, 4  # exit status
 
@@ -65,7 +64,6 @@ def main(config: Config) -> None:
     from touchgoal.control.deployment.preflight import check_client
     from touchgoal.launch.support.cell_run import connect
     from touchgoal.runtime.run_folder import open_run
-    from touchgoal.runtime.viewer.stream import BackgroundStream
 
     file = find_cell_file(config.cell)
     cell = read_cell_file(file, config.policy, config.sim, config.seed, config.task, config.target)
@@ -94,7 +92,7 @@ def main(config: Config) -> None:
     _report(result, out)
 
 
-def load_policy(cell: "CellConfig") -> "tuple[Planner | None, tuple[int, int]]":
+def load_policy(cell: CellConfig) -> tuple[Planner | None, tuple[int, int]]:
     """Return the cell's policy, None for a script, and the size of the camera images that it reads.
 
     UserError: the policy does not fit the cell.
@@ -129,7 +127,7 @@ def load_policy(cell: "CellConfig") -> "tuple[Planner | None, tuple[int, int]]":
     return policy, options.camera_size
 
 
-def _summary(cell: "CellConfig", config: Config) -> str:
+def _summary(cell: CellConfig, config: Config) -> str:
     where = "a simulated FR3 in this program" if cell.arm == "sim" else f"{cell.arm} {cell.address}"
     moves = "it moves" if config.execute else "a dry run, nothing moves"
     return f"{cell.task.name} by {cell.task.policy} on {where}, {cell.task.seconds:g} s at most: {moves}"
@@ -137,13 +135,13 @@ def _summary(cell: "CellConfig", config: Config) -> str:
 
 def _deploy(
     config: Config,
-    cell: "CellConfig",
-    policy: "Planner | None",
+    cell: CellConfig,
+    policy: Planner | None,
     camera_size: tuple[int, int],
     cost: Any,
     connection: "CellConnection",
     episodes: Path,
-    stream: "BackgroundStream | None",
+    stream: BackgroundStream | None,
 ) -> "Result":
     from touchgoal.control.deployment.actors import make_actor
     from touchgoal.control.deployment.session import Session
@@ -180,7 +178,7 @@ def _deploy(
         return session.run()
 
 
-def _shown_in(stream: "BackgroundStream", dt: float) -> "Callable[[TickStatus], None]":
+def _shown_in(stream: BackgroundStream, dt: float) -> "Callable[[TickStatus], None]":
     """Return what logs a tick of `dt` (s), its command as an episode's action."""
     import numpy as np
 

@@ -10,14 +10,12 @@ import shlex
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from touchgoal.episodes.outcomes.judged import JudgedOutcome
+from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Count, checked_dataclass
-
-if TYPE_CHECKING:
-    from touchgoal.episodes.outcomes.judged import JudgedOutcome
-    from touchgoal.episodes.store import EpisodeSet
 
 
 @checked_dataclass
@@ -48,7 +46,6 @@ class Config:
 def main(config: Config) -> None:
     """Go through the rounds, print and plot them."""
     from touchgoal.encoders.training.trackers import Trackers
-    from touchgoal.episodes.store import EpisodeSet
     from touchgoal.policies.checkpoint import find_policy
     from touchgoal.policies.training import improve
     from touchgoal.rewards.judging.judge import find_judge
@@ -82,9 +79,8 @@ def main(config: Config) -> None:
     print(f"next: touchgoal {'run-policy' if env else 'deploy CELL'} --policy {last}")
 
 
-def judge_set(judge: str, episodes: "EpisodeSet") -> "dict[int, JudgedOutcome]":
+def judge_set(judge: str, episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
     """Return what a judge, see `Reward.of_judge`, says of each episode."""
-    from touchgoal.episodes.outcomes.judged import JudgedOutcome
     from touchgoal.rewards.reward import Reward
 
     found = enumerate(Reward.of_judge(judge).judge(episodes))

@@ -12,15 +12,13 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
+from touchgoal.episodes.schema import Episode, is_image
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
-
-if TYPE_CHECKING:
-    from touchgoal.episodes.schema import Episode
 
 _SECONDS = 10.0  # of the newest episode
 # the part before @ of token@host:port, and of an address with user:password@host
@@ -58,7 +56,7 @@ def _contents(run: Path, records: list[Path]) -> Iterator[tuple[str, str | bytes
     yield "doctor.txt", _doctor()
     for path in [*records, run / "metrics.json"]:
         if path.is_file():
-            yield path.name, _without_secrets(path.read_text())
+            yield path.name, _SECRET.sub("...@", path.read_text())
     cell = json.loads(records[-1].read_text()).get("config", {}).get("cell")
     if cell:
         yield "cell" + (Path(cell).suffix or ".toml"), _cell(cell)
@@ -80,13 +78,9 @@ def _cell(name: str) -> str:
     from touchgoal.control.cell.cell_file import find_cell_file
 
     try:
-        return _without_secrets(find_cell_file(Path(name)).read_text())
+        return _SECRET.sub("...@", find_cell_file(Path(name)).read_text())
     except (OSError, UserError) as error:
         return f"{name} cannot be read any more: {error}"
-
-
-def _without_secrets(text: str) -> str:
-    return _SECRET.sub("...@", text)
 
 
 def _newest_episode(root: Path) -> Iterator[tuple[str, str | bytes]]:
@@ -111,10 +105,8 @@ def _newest_episode(root: Path) -> Iterator[tuple[str, str | bytes]]:
         yield f"{name}.jpg", sheet.tobytes()
 
 
-def _table(end: "Episode", features: dict[str, Any], frames: range, fps: float) -> str:
+def _table(end: Episode, features: dict[str, Any], frames: range, fps: float) -> str:
     """Return the numbers of some frames as CSV: the time from the start (s), then a column a component."""
-    from touchgoal.episodes.schema import is_image
-
     columns = {"seconds": [f"{i / fps:.3f}" for i in frames]}
     for key, values in end.frames.items():
         if not is_image(key):

@@ -75,6 +75,7 @@ def main(config: Config) -> None:
     from touchgoal.rewards.reward import Reward
     from touchgoal.rewards.sources.open_source import open_source
     from touchgoal.runtime.errors import UserError
+    from touchgoal.runtime.interruption import on_interruption
     from touchgoal.runtime.run_folder import open_run
 
     if config.ray is not None and config.device != "cpu":
@@ -113,12 +114,9 @@ def main(config: Config) -> None:
     total = len(source.trajectories) + len(source.skipped)
     if done := len(measurement.records):
         print(f"{done:,} of {total:,} trajectories are measured in {out}")
-    try:
+    rest = f"{total} trajectories are measured; the same command with --out {out} continues"
+    with on_interruption(lambda: f"{len(measurement.records)} of {rest}"):
         speed = measurement.run(embed)
-    except KeyboardInterrupt as interruption:
-        kept = f"{len(measurement.records)} of {total} trajectories are measured"
-        interruption.add_note(f"{kept}; the same command with --out {out} continues")
-        raise
     skipped = [*source.skipped, *measurement.skipped]
     summary = write_skipped(skipped, total, out)
     if not measurement.records:

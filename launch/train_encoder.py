@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import tyro
 from pydantic import Field
 
+from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.ssl import config as ssl
 from touchgoal.encoders.training.options import SetTrainerOptions
@@ -205,7 +206,6 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
 
 
 def _fit_to_surfaces(config: Surfaces) -> None:
-    from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.encoders.pretrained import save
     from touchgoal.encoders.whitening.simulated_surfaces import WhiteningConfig, train
 
@@ -224,7 +224,6 @@ def _fit_to_surfaces(config: Surfaces) -> None:
 
 
 def _add_words(config: Words) -> None:
-    from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.encoders import pretrained
     from touchgoal.encoders.alignment.described_touches import embed_grasps, pair
     from touchgoal.encoders.alignment.green_screen import background_changer

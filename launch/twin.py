@@ -10,17 +10,14 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from touchgoal.control.cell.config import SimulatedTask
+from touchgoal.control.cell.config import CellConfig, SimulatedTask
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Seed, checked_dataclass
 from touchgoal.sim_envs.config import STREAM_SIZE, BeadMazeConfig, PickPlaceConfig, TaskConfig
-
-if TYPE_CHECKING:
-    from touchgoal.control.cell.config import CellConfig
 
 _PARENT = os.getppid()  # as the command begins: loading takes seconds
 ENVS: dict[SimulatedTask, TaskConfig] = {
@@ -96,7 +93,7 @@ def main(config: Config) -> None:
     numbers: dict[str, float] = dict(twin.pace.summary())
     numbers |= {"pictures_taken": images.taken, "pictures_left_out": images.left_out}
     write_json(out / "metrics.json", numbers)
-    print("\n" + "\n".join(_pace_lines(numbers)) + "stopped")
+    print(f"\n{_pace(numbers)}\nstopped")
 
 
 def open_to_network(host: str) -> str:
@@ -113,7 +110,7 @@ def open_to_network(host: str) -> str:
     )
 
 
-def _table(cell: "CellConfig") -> str:
+def _table(cell: CellConfig) -> str:
     assert cell.load_cell is not None
     lines = {"task": cell.task.instruction, f"arm ({cell.arm})": cell.address}
     lines["gripper"] = cell.gripper.port or cell.gripper.address
@@ -124,15 +121,14 @@ def _table(cell: "CellConfig") -> str:
     return "\n".join(f"{name:<18}{where}" for name, where in lines.items())
 
 
-def _pace_lines(numbers: dict[str, float]) -> list[str]:
+def _pace(numbers: dict[str, float]) -> str:
     if not numbers["seconds"]:
-        return ["no client drove the arm for a whole second: no pace to report", ""]
-    return [
+        return "no client drove the arm for a whole second: no pace to report"
+    return (
         f"{numbers['seconds']} s with a client that drives the arm: simulated over wall time "
-        f"{numbers['pace_median']:.2f} in the median second, {numbers['pace_slowest']:.2f} in the slowest",
+        f"{numbers['pace_median']:.2f} in the median second, {numbers['pace_slowest']:.2f} in the slowest\n"
         f"images left out to keep pace: {numbers['pictures_left_out']} of "
-        f"{numbers['pictures_taken'] + numbers['pictures_left_out']}",
+        f"{numbers['pictures_taken'] + numbers['pictures_left_out']}\n"
         f"processor time a simulated second: {numbers['processor_twin']:.2f} s, and "
-        f"{numbers['processor_pictures']:.2f} s for images",
-        "",
-    ]
+        f"{numbers['processor_pictures']:.2f} s for images"
+    )
