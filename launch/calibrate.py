@@ -6,6 +6,7 @@ are found, unless x_px, y_px and radius_px give them (the first pixel is 0, 0). 
 """
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -81,17 +82,8 @@ def main(config: Config) -> None:
                 train, pitch, config.sensor, bar.update, config.squares
             )
     with progress_bar("fitting", 2 * calibrate.STEPS, "step") as bar:
-        judged, fitted = (
-            calibrate.fit(
-                each,
-                pitch,
-                config.sensor,
-                bar.update,
-                illumination_exponent=power,
-                squares=config.squares,
-            )
-            for each in (train, presses)
-        )
+        fit = partial(calibrate.fit, illumination_exponent=power, squares=config.squares)
+        judged, fitted = (fit(each, pitch, config.sensor, bar.update) for each in (train, presses))
     errors = report.held_out_errors(judged, test)
     print(report.errors_table(errors, len(test)))
     report.require_better_than_background(errors)

@@ -41,16 +41,14 @@ def main(config: Config) -> None:
     from touchgoal.runtime.progress import track
     from touchgoal.runtime.run_folder import open_run
 
-    found, again = (
-        find_recordings(config.source, config.fps),
-        f"touchgoal import-demos {config.source}",
-    )
+    found = find_recordings(config.source, config.fps)
     if config.map is None:
         first, path = found[0](), Path(f"{config.source.stem}_map.json")
         if path.exists():
             raise UserError(f"{path} exists: give it by --map, or remove it")
         write_json(path, chosen := propose_map(first, config.fps))
-        print(f"{chosen.table(first)}\nwritten to {path}; if it is right: {again} --map {path}")
+        again = f"touchgoal import-demos {config.source} --map {path}"
+        print(f"{chosen.table(first)}\nwritten to {path}; if it is right: {again}")
         return
     chosen = read_config(config.map, FeatureMap, "map")
     if not chosen.task:

@@ -65,7 +65,6 @@ def align_touch(config: Align) -> None:
 
 def _align_wand(config: Align) -> None:
     """Align on touches of the wand; there are no successful episodes to fit a normalizer on."""
-
     if config.validation is not None:
         raise UserError(f"{config.data} holds touches of the wand: leave --validation out")
     data = WandSet.open(config.data)
@@ -81,7 +80,6 @@ def _align_wand(config: Align) -> None:
 
 def _align_annotated(config: Align, validation: Path) -> None:
     """Align on the annotations of `annotate`; without successful episodes no normalizer is fitted."""
-
     train, val = open_annotations(config.data, validation, config.sensor)
     towers = load_towers(config.towers)
     out = open_training(config, "train-encoder")

@@ -34,12 +34,11 @@ def check_cell(cell: "CellConfig", connection: "CellConnection", episodes: Path)
     from touchgoal.control.safety.action_filter import ActionFilter
     from touchgoal.episodes.store import EpisodeWriter
 
-    def count_episodes() -> int:
-        return len(EpisodeWriter(episodes, ft.CONTROL_HZ))
-
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     print("checks before anything moves:", flush=True)
-    results = preflight(cell, connection, safety, episodes, count_episodes)
+    results = preflight(
+        cell, connection, safety, episodes, lambda: len(EpisodeWriter(episodes, ft.CONTROL_HZ))
+    )
     print("\n".join(map(str, results)), flush=True)
     require_all_ok(results)
     return safety

@@ -191,10 +191,8 @@ def all_options(
     """
     groups = []
     for field, annotation, _ in _options(config_type):
-        marks, typed = (
-            getattr(annotation, "__metadata__", ()),
-            prefix + field.name.replace("_", "-"),
-        )
+        marks = getattr(annotation, "__metadata__", ())
+        typed = prefix + field.name.replace("_", "-")
         is_rare = rare or RARE in marks
         of_task = field.name == "env" and env is not None
         inner = type(env) if of_task else _bare(annotation)

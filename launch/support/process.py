@@ -32,8 +32,12 @@ def run_command(program: str, arguments: list[str], action: Callable[..., None])
     """
     prog, whole = f"{program} {arguments[0]}", "--traceback" in arguments
     arguments = [argument for argument in arguments if argument != "--traceback"]
-    with _recorded_as([program, *arguments]), terminable():
-        _report_errors(prog, action, arguments, whole)
+    before, sys.argv = sys.argv, [program, *arguments]  # the command that the run's record names
+    try:
+        with terminable():
+            _report_errors(prog, action, arguments, whole)
+    finally:
+        sys.argv = before
 
 
 def _report_errors(
@@ -101,14 +105,3 @@ def _prepare_streams() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-
-
-@contextmanager
-def _recorded_as(arguments: list[str]) -> Iterator[None]:
-    """Make `arguments` the command that the run's record names, its program first."""
-    before = sys.argv
-    sys.argv = arguments
-    try:
-        yield
-    finally:
-        sys.argv = before
