@@ -132,7 +132,10 @@ def test_each_arm_is_driven_at_its_rate(monkeypatch: Patch) -> None:
         connection.connect_arm(read_cell_file(EXAMPLES / f"{name}.toml"), 20.0)
         config = made.call_args.args[1]
         assert (config.rate, config.state_timeout, config.hz) == (rate, timeout, 20.0)
-        assert made.call_args.kwargs == {"connect_timeout": 30.0}
+        assert made.call_args.kwargs == {"connect_timeout": 30.0, "call_timeout": 1.5}
+    still = replace(read_cell_file(EXAMPLES / "fr3_two_minis.toml"), lock_step=True)
+    connection.connect_arm(still, 20.0)  # nothing moves while a twin in lock-step is late
+    assert made.call_args.kwargs["call_timeout"] == 60.0
 
 
 def use(monkeypatch: Patch, **modules: MagicMock) -> None:
