@@ -1,6 +1,7 @@
 """Both sides of each figure of the drivers, on the makers' client libraries with a simulated clock."""
 
 import signal
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
 from unittest.mock import MagicMock, call
