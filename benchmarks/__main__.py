@@ -43,6 +43,10 @@ BENCHMARKS = {
     ),
     "reward-use": ("papers.reward_use", "learning from the demonstrations that a reward accepts"),
     "improve": ("papers.improve", "a policy improved by its own runs, by what accepts them"),
+    "improve-carry": (
+        "papers.improve_carry",
+        "fragile-carry improved by runs that a judge accepts",
+    ),
     "grip-search": ("papers.grip_search", "grip force found by trial where a crush is not seen"),
     "shaping": ("papers.shaping", "SAC by a sparse reward, and shaped by the cost"),
     "tacbench": ("papers.tacbench.benchmark", "force, slip, pose, grasp, cloth from frozen touch"),

@@ -147,14 +147,6 @@ def loaders(metrics: Metrics) -> str:
     return f"lerobot {lerobot:.0f}; first epoch {first:.0f}; whole training {whole:,.0f} a second"
 
 
-def scaled(metrics: Metrics) -> str:
-    """Highest measured rate, and the model's error at the number of workers that it was not given."""
-    workers, most = max(metrics["rates"].items(), key=lambda pair: pair[1])
-    return (
-        f"{most:.0f} a second with {workers} workers; predicted point off by {metrics['off']:.0%}"
-    )
-
-
 def plan(metrics: Metrics) -> str:
     """Time of a whole plan."""
     stage = next(s for s in metrics["stages"] if s["what"].startswith("a whole plan"))

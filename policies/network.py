@@ -283,7 +283,8 @@ class PolicyNetwork(nn.Module):
         elif self.key_pose:
             assert average is not None, "needs the episode's average, or the true key poses"
             maps, hand = self.seen(batch)
-            pose = average.add(*self.key_pose(maps, hand), hand[:, :7])
+            estimate, weight = self.key_pose(maps, hand)
+            pose = average.add(estimate, weight, hand[:, :7])
         encoded = self._encode(batch, self._encode_touch(batch), pose)
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)

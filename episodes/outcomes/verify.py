@@ -25,7 +25,7 @@ class Truth:
         position, turn = np.split(frames[ft.TCP_POSE], [3], axis=1)
         hand = Rotation.from_quat(turn, scalar_first=True)
         # whether a pad touches something
-        self.touched: Bool[np.ndarray, " n"] = frames[ft.TRUTH_CONTACT].any(axis=1)
+        self.touched: Bool[np.ndarray, " n"] = np.any(frames[ft.TRUTH_CONTACT], axis=1)
         # of the object above its start, and from the goal over the table, m
         self.height: Float[np.ndarray, " n"] = place[:, 2] - start[:, 2]
         self.away: Float[np.ndarray, " n"] = np.linalg.norm(place[:, :2] - start[:, 5:7], axis=1)

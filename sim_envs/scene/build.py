@@ -6,10 +6,10 @@ World frame = the robot's base frame, table top at z = 0.
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
 from touchgoal.control.motion.tool import FRANKA_HAND, SENSOR_BELOW_CARRIAGE, Tool
 from touchgoal.control.motion.tracker import SERVO_DAMPING
@@ -21,7 +21,7 @@ from touchgoal.sim_envs.scene.variety import place_camera
 
 SIDES = ("left", "right")
 OBJECT_GROUP, VISUAL_GROUP, HIDDEN_GROUP = 1, 2, 3
-NO_CONTACT = {"contype": 0, "conaffinity": 0}
+NO_CONTACT: dict[str, Any] = {"contype": 0, "conaffinity": 0}
 """Options of a geom that meets nothing."""
 GRIPPER_MAX_FORCE = 80.0  # N, both fingers; opening never needs a limit below it
 
@@ -306,15 +306,13 @@ def add_body(spec: mujoco.MjSpec, body: Body) -> None:
     )
 
 
-def quaternion(R: np.ndarray) -> Float[np.ndarray, "4"]:
+def quaternion(R: np.ndarray) -> list[float]:
     """Return the quaternion (wxyz) of a rotation, (3, 3) or its 9 numbers by rows."""
     mujoco.mju_mat2Quat(quat := np.empty(4), np.ravel(R))
-    return quat
+    return quat.tolist()
 
 
-def look_at(
-    eye: Sequence[float], target: Sequence[float], up: Sequence[float]
-) -> Float[np.ndarray, "4"]:
+def look_at(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> list[float]:
     """Return the orientation (wxyz) of a camera at `eye` that looks at `target`, `up` upwards."""
     z = np.subtract(eye, target)
     z = z / np.linalg.norm(z)

@@ -171,7 +171,7 @@ def _add_screen(spec: mujoco.MjSpec) -> None:
 
 def _add_part(spec: mujoco.MjSpec, holder: mujoco.MjsBody, name: str, part: Part) -> Body:
     """Add a part twice: as the gel feels it, and coarser as cameras see it."""
-    item = holder.add_body(name=name, pos=part.position, quat=quaternion(part.rotation))
+    item = holder.add_body(name=name, pos=part.position.tolist(), quat=quaternion(part.rotation))
     for group, mesh in ((OBJECT_GROUP, part.mesh), (VISUAL_GROUP, part.coarse)):
         shape: dict = (
             {"size": [*part.size, 0, 0][:3]} if mesh is None else {"meshname": _mesh(spec, mesh)}
