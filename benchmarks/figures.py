@@ -30,11 +30,6 @@ def fewest_and_most(metrics: Metrics) -> str:
     return f"worst {worst}, best {best}"
 
 
-def each_row(metrics: Metrics) -> str:
-    """Success of every row."""
-    return "; ".join(str(_rate(row["trials"])) for row in metrics["rows"])
-
-
 def looks(metrics: Metrics) -> str:
     """Shares of looks that are right, refused, and confident and wrong, over all changes."""
     rows = metrics["rows"]

@@ -2,15 +2,13 @@
 
 import json
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pydantic import TypeAdapter
 from pydantic_core import to_json
 
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
-
-Kind = TypeVar("Kind")
 
 
 def parse_json(data: bytes) -> Any:
@@ -21,8 +19,8 @@ def parse_json(data: bytes) -> Any:
         raise ValueError("it is nested too deeply") from error
 
 
-def read_json(path: Path, kind: type[Kind], otherwise: str) -> Kind:
-    """Read what `write_json` wrote of a dataclass, or of a dict of them.
+def read_json(path: Path, kind: Any, otherwise: str) -> Any:
+    """Read what `write_json` wrote of a `kind`: a dataclass, or a dict of them such as dict[int, C].
 
     UserError, which says `otherwise`: there is no such file, or it holds something else.
     """
