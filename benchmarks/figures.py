@@ -53,7 +53,7 @@ def audited(metrics: Metrics) -> str:
     for row in metrics["rows"]:
         tasks.setdefault(row["what"].split(", ")[0], []).append(_rate(row["trials"]))
     return "; ".join(
-        f"{task} {whole}, changed at most {max(changed, key=lambda rate: rate.successes)}"
+        f"{task} {whole}, changed {max(changed, key=lambda rate: rate.successes)}"
         for task, (whole, *changed) in tasks.items()
     )
 

@@ -137,8 +137,8 @@ def _improved(
 def _success(config: Config, policy: Path) -> SuccessRate:
     file = policy.parent / "trials.json"
     if not file.exists():
-        tried = {"episodes": config.trials, "seed": _TRIED, "workers": config.workers}
-        found = evaluate(policy, FragileCarryConfig(), **tried)
+        task, count = FragileCarryConfig(), config.trials
+        found = evaluate(policy, task, episodes=count, seed=_TRIED, workers=config.workers)
         write_json(file, [trial.success for trial in found.trials])
     true = parse_json(file.read_bytes())
     return SuccessRate(sum(true), len(true))
