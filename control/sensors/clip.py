@@ -178,7 +178,8 @@ def _video_frames(path: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
 
 
 def _check_format(frame: av.VideoFrame, path: Path) -> None:
-    if name := _HDR.get(frame.color_trc):
+    # PyAV tells it from 17 on; lerobot pins an older one, where HDR is refused by its ten bits
+    if name := _HDR.get(getattr(frame, "color_trc", -1)):
         raise UserError(f"{path} is HDR ({name}): re-encode it as 8-bit SDR, BT.709")
     channels = frame.format.components
     if any(channel.is_alpha for channel in channels):
