@@ -131,7 +131,7 @@ class _Lab:
         label = {
             "judge": partial(judge_set, str(self.judge)),
             "truth": partial(_truth, folder, len(EpisodeSet(data))),
-            "none": _everything,
+            "none": everything,
         }[name]
         return Improvement(folder, data, self.config.runs, self.record, label, train)
 
@@ -157,10 +157,7 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
     if (done := len(EpisodeSet(root)) - len(EpisodeSet(data))) < config.runs:
         lab.record(first.policy(0), root, range(done, config.runs))
     for name in config.filters:
-        if not (folder := out / name).exists():
-            shutil.rmtree(out / "unfinished", ignore_errors=True)
-            shutil.copytree(first.out, out / "unfinished")
-            (out / "unfinished").rename(folder)
+        go_on_from(first.out, out / name)
 
     def improved(job: tuple[int, Filter]) -> dict[str, Any]:
         own = _Lab(config, out, 1 + job[0])
@@ -194,7 +191,18 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
     return {"table": "\n".join(lines), "trials": config.trials, "imitation": found}
 
 
-def _everything(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
+def go_on_from(first: Path, folder: Path) -> None:
+    """Begin a filter's rounds with a copy of what all share, unless it has begun."""
+    if folder.exists():
+        return
+    unfinished = folder.with_name("unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    shutil.copytree(first, unfinished)
+    unfinished.rename(folder)
+
+
+def everything(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
+    """Accept all episodes of a set."""
     return {i: JudgedOutcome("success") for i in range(len(episodes))}
 
 

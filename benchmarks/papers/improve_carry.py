@@ -1,21 +1,22 @@
 """A policy of fragile-carry improved by its own runs in simulation, by what accepts them.
 
-Success is felt alone: no camera looks on. A policy learns from a few of the expert's demonstrations; its runs are
-accepted by a judge of touch and force that is fitted on these demonstrations, by the simulator's truth, or all of
-them, and it learns anew, round after round. The first round's runs are the same in all. What the folder of an
-earlier run holds is taken from there.
+There is no camera: the judge reads touch and force. A policy is trained on a few of the expert's demonstrations,
+runs, and is trained on the accepted runs as well, round after round: those that the judge (fitted on the
+demonstrations) or the simulator's truth accepts, or all of them. The first round's runs are the same in all three.
+The same command continues an interrupted run.
 """
 
 import shutil
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from benchmarks.deployment.own_task import touchgoal
 from benchmarks.options import CORES, BenchmarkOptions
+from benchmarks.papers.improve import Filter, everything, go_on_from
 from touchgoal.episodes.outcomes.judged import JudgedOutcome
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.improve import judge_set, train_accepted
@@ -33,7 +34,6 @@ from touchgoal.runtime.json_file import parse_json, write_json
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.config import FragileCarryConfig
 
-Filter = Literal["judge", "truth", "none"]
 _TRIED = seeds.POLICY_TEST.start + 300_000  # scenes of the trials
 _DEMONSTRATIONS = seeds.TRAINING.start + 2_000
 
@@ -43,7 +43,7 @@ class Config(BenchmarkOptions):
     """Options of benchmark improve-carry."""
 
     filters: tuple[Filter, ...] = get_args(Filter)
-    """What accepts runs: a judge fitted on the demonstrations, the simulator's truth, or nothing (all are)."""
+    """What accepts runs: a judge fitted on the demonstrations, the simulator's truth, or none: all are accepted."""
     demonstrations: Count = 20
     """Demonstrations; a fifth as many are recorded to validate on."""
     rounds: Count = 2
@@ -113,7 +113,7 @@ def _improvement(config: Config, out: Path, name: str, filter_: Filter) -> Impro
     label = {
         "judge": partial(judge_set, str(out / "judge-fit")),
         "truth": _truth,
-        "none": lambda episodes: {i: JudgedOutcome("success") for i in range(len(episodes))},
+        "none": everything,
     }[filter_]
     train = partial(train_accepted, validation, config.train)
     return Improvement(out / name, data, config.runs, record, label, train)
@@ -123,10 +123,7 @@ def _improved(
     config: Config, out: Path, name: Filter, first: Path
 ) -> tuple[SuccessRate, list[bool], list[bool]]:
     """Return the last policy's success, and of each run whether it was accepted and truly right."""
-    if not (out / name).exists():
-        shutil.rmtree(out / f"unfinished-{name}", ignore_errors=True)
-        shutil.copytree(first, out / f"unfinished-{name}")
-        (out / f"unfinished-{name}").rename(out / name)
+    go_on_from(first, out / name)
     work = _improvement(config, out, name, name)
     done = list(work.rounds(config.rounds))
     accepted = [verdict == "success" for one in done for verdict in one.verdicts]

@@ -4,7 +4,6 @@ python lerobot_loader.py SET OUT BATCH SAMPLES
 """
 
 import json
-import os
 import sys
 import time
 from importlib.metadata import version
@@ -40,7 +39,6 @@ def main() -> None:
         "shuffled": rate(dataset, batch, samples, shuffle=True),
         "in_order": rate(dataset, batch, samples, shuffle=False),
         "version": version("lerobot"),
-        "cores": len(os.sched_getaffinity(0)),
     }
     out.write_text(json.dumps(found))
 

@@ -1,8 +1,8 @@
 """Training samples a second on one core: lerobot's loader and train-policy's, on one set in one run.
 
 A sample is two ticks of both fingertips and of the arm, with the actions of eight. lerobot decodes the images of every
-sample anew, and hands out images: embedding them is not counted. train-policy embeds each image once, by its
-frozen encoder, keeps the embeddings beside the set and draws from memory: its first epoch pays for all.
+sample anew and returns images: the time to embed them is not counted. train-policy embeds each image once with its
+frozen encoder, keeps the embeddings beside the set and samples from memory; the embedding counts in its first epoch.
 """
 
 import subprocess

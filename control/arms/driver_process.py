@@ -20,12 +20,16 @@ from typing import Any, Protocol, runtime_checkable
 from touchgoal.control.interfaces import DriverError
 from touchgoal.runtime.errors import UserError
 
-CALL_TIMEOUT = 1.5  # s that a call may take
-PATIENT = 60.0  # s instead on a twin in lock-step, where nothing moves in the meantime
+_CALL_TIMEOUT = 1.5  # s, of an arm or hand that may move
 _GRACE = 1.0  # s that the kernel's alarm waits beyond the parent's time-out
 _CLOSING = 3.0  # s to bring an arm to rest and disconnect
 NEVER = 1e6  # s, period of a driver that ticks on request alone
 _EXIT_WITH_REASON = 3  # exit code; the reason is the last line of output
+
+
+def call_timeout(lock_step: bool) -> float:
+    """Return how long (s) a call may take; while a twin in lock-step is late, nothing moves."""
+    return 60.0 if lock_step else _CALL_TIMEOUT
 
 
 @runtime_checkable
@@ -55,7 +59,7 @@ class DriverProcess:
         driver: Callable[..., Driver],
         *args: Any,
         connect_timeout: float = 30.0,
-        call_timeout: float = CALL_TIMEOUT,
+        call_timeout: float = _CALL_TIMEOUT,
     ) -> None:
         self._name, self._lock = driver.__qualname__, threading.Lock()
         self._timeout = call_timeout

@@ -12,13 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.arms.driver_process import (
-    CALL_TIMEOUT,
-    NEVER,
-    PATIENT,
-    DriverProcess,
-    error_line,
-)
+from touchgoal.control.arms.driver_process import NEVER, DriverProcess, call_timeout, error_line
 from touchgoal.control.interfaces import STOPPED_ON_REQUEST, ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker, TrackerState
@@ -188,14 +182,11 @@ class ArmProcess:
         recover: bool = False,
         connect_timeout: float = 30.0,
     ) -> None:
-        call_timeout = PATIENT if config.lock_step else CALL_TIMEOUT
-        self._make = lambda recover: DriverProcess(
-            client,
-            config,
-            recover,
-            connect_timeout=connect_timeout,
-            call_timeout=call_timeout,
-        )
+        timeouts = {
+            "connect_timeout": connect_timeout,
+            "call_timeout": call_timeout(config.lock_step),
+        }
+        self._make = lambda recover: DriverProcess(client, config, recover, **timeouts)
         self._process = self._make(recover)
         self._last: ArmReading = self._process.call("read")
 

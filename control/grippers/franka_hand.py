@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from touchgoal.control.arms.client_libraries import FRANKY
-from touchgoal.control.arms.driver_process import CALL_TIMEOUT, NEVER, PATIENT, DriverProcess
+from touchgoal.control.arms.driver_process import NEVER, DriverProcess, call_timeout
 from touchgoal.control.grippers.hand_commands import PERIOD, SPEED, HandCommands, LastCommand
 from touchgoal.control.interfaces import DriverError, Gripper, GripperReading
 from touchgoal.control.sensors.latest_value import LatestValue
@@ -117,10 +117,8 @@ class FrankaHand:
     """Gripper over a Franka Hand; it closes with `force` (N, 30 to 70)."""
 
     def __init__(self, address: str, force: float = 30.0, lock_step: bool = False) -> None:
-        timeout = PATIENT if lock_step else CALL_TIMEOUT
-        self._process = DriverProcess(
-            FrankaHandClient, address, force, lock_step, call_timeout=timeout
-        )
+        own = FrankaHandClient, address, force, lock_step
+        self._process = DriverProcess(*own, call_timeout=call_timeout(lock_step))
 
     def read(self) -> GripperReading:
         """See Gripper."""

@@ -1,4 +1,4 @@
-"""What the maps of sentences and images to a fixed touch encoder are fitted to (see `heads`)."""
+"""Training data for the maps from sentences and images to a fixed touch encoder (see `heads`)."""
 
 from collections.abc import Callable
 

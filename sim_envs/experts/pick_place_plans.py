@@ -181,7 +181,7 @@ PLANS: dict[Outcome, Callable[[PickPlace], Plan]] = {
     "wrong_object": partial(_pick_and_place, body=picked_body("wrong_object")),
     "same_shape": _pick_and_place,  # the scene holds another object than the one asked for
 }
-"""What makes the plan that leads to an outcome, from ground truth after a reset."""
+"""By outcome: the function that plans it, from ground truth after a reset."""
 
 
 def _before(plan: Plan, name: str) -> Plan:
