@@ -112,7 +112,7 @@ def main(config: Config) -> None:
     print(f"spread of successful ends by part: {units or 'none, for no two hold the same object'}")
     if config.judge:
         failed = [embed_end(embedder, t) for t in track(failures, "embedding failures", "episode")]
-        judge = fit_judge(embedded, failed, value)
+        judge = fit_judge(embedded, failed, value, embedder.towers.name)
         judge.save(out / JUDGE)
         print(f"{judge}\nnext: touchgoal judge SET --judge {out}")
         return

@@ -57,11 +57,12 @@ def main(config: Config) -> None:
         raise UserError(
             f"--correct teaches the judge, and {folder} came with touchgoal: copy it first"
         )
-    source = open_source(config.source, "front", keys=parse_keys(config.keys))
+    reward = Reward.of_judge(config.judge, config.encoder)
+    source = open_source(config.source, reward.camera, keys=parse_keys(config.keys))
     trajectories = [t for t in source.trajectories if isinstance(t, EpisodeTrajectory)]
     if not trajectories:
         raise UserError(f"{config.source} is no set of episodes: give one")
-    prepared = Reward.of_judge(config.judge, config.encoder).prepare(source.inputs)
+    prepared = reward.prepare(source.inputs)
     judge, episodes = prepared.judge, trajectories[0].episodes
     told = {i: one for i, one in read_judged(episodes).items() if one.by == "person"}
     out = open_run(config.out, "judge", config)

@@ -1,6 +1,7 @@
 """The reward: how far each frame of a trajectory is from a goal, in images, touch and words."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import overload
 
@@ -16,11 +17,17 @@ from touchgoal.encoders.towers.towers import OfflineTowers, Towers, load_towers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.curves import Curves
-from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNormalizer, scene_of
+from touchgoal.rewards.distance.normalizer import (
+    NORMALIZER,
+    REMEDY,
+    DistanceNormalizer,
+    EmbeddingSource,
+    scene_of,
+)
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
-from touchgoal.rewards.features.successful_ends import GOAL_FILE
+from touchgoal.rewards.features.successful_ends import GOAL_FILE, SuccessfulEnds
 from touchgoal.rewards.goals import (
     SIDES,
     GoalFile,
@@ -36,7 +43,7 @@ from touchgoal.rewards.goals import (
     goals_of_script,
     same_episode,
 )
-from touchgoal.rewards.judging.judge import Judgement, find_judge
+from touchgoal.rewards.judging.judge import JUDGE, Judge, Judgement, find_judge
 from touchgoal.rewards.prepared_reward import PreparedReward
 from touchgoal.rewards.sources.episode_trajectories import default_goals
 from touchgoal.rewards.sources.open_source import open_source
@@ -103,7 +110,8 @@ class Reward:
         self._encoder, self._towers, self._plain, self._device = encoder, towers, plain, device
         self._normalizer = normalizer  # one read, or "encoder", "none", or None: by the scene
         self._folder: Path | None = None  # of the given normalizer
-        self._name, self._judges = "the given normalizer", False
+        self._name = "the given normalizer"
+        self._judged: EmbeddingSource | None = None  # what a judge was fitted on
         if isinstance(normalizer, str | Path) and str(normalizer) not in ("encoder", "none"):
             self._normalizer = DistanceNormalizer.load(Path(normalizer))
             self._name, self._folder = str(normalizer), Path(normalizer).parent
@@ -115,12 +123,19 @@ class Reward:
     def of_judge(cls, judge: str | Path, encoder: str | None = None) -> "Reward":
         """Return the reward with the goals, units, value and judge of `fit-normalizer --judge`.
 
-        `judge` is its folder, or the name of an encoder that ships with one; UserError: it has none.
+        `judge` is its folder, or the name of an encoder that ships with one. It measures what it was
+        fitted on: that camera, with its towers, and touch or images alone. UserError: there is no judge.
         """
         folder = find_judge(judge)
-        found = cls(GoalFile(folder / GOAL_FILE), encoder=encoder, normalizer=folder / NORMALIZER)
-        found._judges = True  # by the parts alone
+        goal, towers = folder / GOAL_FILE, Judge.load(folder / JUDGE).towers or None
+        found = cls(GoalFile(goal), encoder=encoder, towers=towers, normalizer=folder / NORMALIZER)
+        found._judged = SuccessfulEnds.load(goal).made_with
         return found
+
+    @property
+    def camera(self) -> str:
+        """Key of the camera that a judge was fitted on; without a judge the front one."""
+        return (self._judged and self._judged.camera) or FRONT
 
     @overload
     def __call__(
@@ -178,9 +193,9 @@ class Reward:
         for curves.
         """
         if isinstance(recording, Episode):
-            found = self._embed_episode(recording, FRONT, fps, scene_of(recording.frames))
+            found = self._embed_episode(recording, self.camera, fps, scene_of(recording.frames))
             return found[0].judge_episode(found[1])
-        ends = self._embed_set(recording, FRONT, embed_end)
+        ends = self._embed_set(recording, self.camera, embed_end)
         return [reward.judge_episode(e) for reward, e in ends]
 
     def prepare(self, inputs: Inputs, goals: Sequence[GoalSpec] = ()) -> PreparedReward:
@@ -189,6 +204,9 @@ class Reward:
         `goals` stand in for the reward's own. UserError: whatever would stop the measurement.
         """
         specs = goals or self.goals or [OwnFrame()]
+        if self._judged is not None:
+            sides = inputs.sides if self._judged.encoder else ()
+            inputs = replace(inputs, sides=sides, camera=self.camera)
         towers = self._towers
         together = towers not in (None, OfflineTowers.name)
         if towers is not None and not isinstance(towers, str):
@@ -280,7 +298,7 @@ class Reward:
                 found = DistanceNormalizer.load(path)
         if found is not None:
             own = same_episode(goals)
-            without = () if self._plain else ("image", "tactile") if self._judges else ("tactile",)
+            without = () if self._plain else ("image", "tactile") if self._judged else ("tactile",)
             unfit = found.mismatch(embedder.made_with, goals, own, without)
             if given is None and found.scene != inputs.scene:
                 unfit = (

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from test_episode_embedder import embedder, recorded  # noqa: F401
 from test_reward_parts import embedded
+from test_towers import clip_directory  # noqa: F401
 
 from touchgoal.control.features import (
     FRONT,
@@ -103,9 +104,12 @@ def test_a_hand_that_lets_go_is_judged_by_what_it_carried(embedder: EpisodeEmbed
 
 
 def test_fitted_judged_and_corrected(
-    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    here: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    clip_directory: Path,  # noqa: F811
 ) -> None:
-    """Images alone; a person's word stays when the set is judged again."""
+    """Images alone; a person's word stays when the set is judged again; camera and towers are kept."""
     pytest.importorskip("transformers")
     episode, fit = recorded(), ("fit-normalizer", "set", "--judge", "--out")
     for k in range(10):
@@ -143,6 +147,10 @@ def test_fitted_judged_and_corrected(
     main([*judge, "again"])
     told = json.loads(Path("set/judged.json").read_text())
     assert [one["verdict"] for one in told.values() if one["by"] == "person"] == ["failure"]
+    main([*fit, "clip", "--towers", str(clip_directory), "--camera", "wrist"])
+    assert json.loads(Path("clip/judge.json").read_text())["towers"].startswith(str(clip_directory))
+    main(["judge", "set", "--judge", "clip", "--out", "seen"])
+    assert json.loads(Path("set/judged.json").read_text())["9"]["verdict"] == "failure"
 
 
 def test_the_limits_keep_their_bounds_and_doubt_without_failures(tmp_path: Path) -> None:

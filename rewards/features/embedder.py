@@ -87,7 +87,7 @@ class EpisodeEmbedder:
             parts: embed everything that the parts of a cost need: both cameras, their maps, and the
                 contact of the fingertips; else one camera and touch.
         """
-        self._towers, self.encoder = towers, encoder
+        self.towers, self.encoder = towers, encoder
         self._aligned = encoder if encoder is not None and encoder.towers else None
         self.knows_words = self._aligned is not None  # touch can be compared with sentences
         self.camera, self.parts = camera, parts
@@ -109,7 +109,7 @@ class EpisodeEmbedder:
     @cached_property
     def fingerprint(self) -> list[str]:
         """All that an embedding depends on beside the frames: weights, preprocessor, camera, parts."""
-        towers = self._towers
+        towers = self.towers
         weights = towers.image_weights if isinstance(towers, OfflineTowers) else towers.name
         return [*asdict(self.made_with).values(), weights.rpartition("#")[2], str(self.parts)]
 
@@ -208,12 +208,12 @@ class EpisodeEmbedder:
     def embed_cameras(self, frames: Frames) -> Features:
         """Return image, and with parts the pooled features and map of each camera."""
         features: dict[str, np.ndarray] = {}
-        offline = self._towers if isinstance(self._towers, OfflineTowers) else None
+        offline = self.towers if isinstance(self.towers, OfflineTowers) else None
         others = CAMERAS if self.parts else ()
         for key in dict.fromkeys(key for key in (*others, self.camera) if key in frames):
             images = frames[key] if offline is None else steady_images(frames[key])
             if offline is None or not self.parts:
-                pooled = self._towers.embed_images(images)
+                pooled = self.towers.embed_images(images)
             else:
                 pooled, features[map_name(key)] = offline.embed_with_maps(images)
             features[camera_name(key) if self.parts else IMAGE] = _unit(pooled)
@@ -224,13 +224,13 @@ class EpisodeEmbedder:
     def embed_sentences(self, sentences: Sequence[str]) -> Float32[np.ndarray, "m k"]:
         """Return unit embeddings of sentences on how touch feels, comparable with its embeddings."""
         assert self._aligned is not None  # without it no modality takes a sentence
-        return self._aligned.embed_text_goal(list(sentences), self._towers)
+        return self._aligned.embed_text_goal(list(sentences), self.towers)
 
     def _embed_goal(self, modality: Modality, spec: GoalSpec, own: EmbeddedEpisode) -> Features:
         """Return the features of a goal; those that are not of the modality do not count."""
         if isinstance(spec, Sentence):
-            assert self._towers.pretrained_together  # or a sentence is no goal for images
-            return {IMAGE: _unit(self._towers.embed_texts([spec.text]))}
+            assert self.towers.pretrained_together  # or a sentence is no goal for images
+            return {IMAGE: _unit(self.towers.embed_texts([spec.text]))}
         if isinstance(spec, GoalImage):
             return self.embed_cameras({self.camera or FRONT: spec.read()})
         if isinstance(spec, OwnFrame):

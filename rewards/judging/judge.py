@@ -9,7 +9,7 @@ successes exceed; how many failures pass is then unknown.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +67,7 @@ class Judge:
 
     successes: tuple[float, ...]  # costs of ends of successes
     failures: tuple[float, ...] = ()  # and of failures, made on purpose or corrected by a person
+    towers: str = ""  # that saw the images, see `load_towers`; "": those of the touch encoder
 
     def __post_init__(self) -> None:
         """Raise UserError if there are too few successes."""
@@ -100,8 +101,8 @@ class Judge:
     def corrected(self, cost: float, success: bool) -> "Judge":
         """Return the judge with one more known end."""
         if success:
-            return Judge((*self.successes, cost), self.failures)
-        return Judge(self.successes, (*self.failures, cost))
+            return replace(self, successes=(*self.successes, cost))
+        return replace(self, failures=(*self.failures, cost))
 
     def __str__(self) -> str:
         return (
@@ -142,13 +143,17 @@ def _quantile(costs: Sequence[float], beyond: float) -> float:
 
 
 def fit_judge(
-    successes: Sequence[EmbeddedEpisode], failures: Sequence[EmbeddedEpisode], value: Value | None
+    successes: Sequence[EmbeddedEpisode],
+    failures: Sequence[EmbeddedEpisode],
+    value: Value | None,
+    towers: str = "",
 ) -> Judge:
     """Return the judge of successes, each measured by the other three of 4 folds, and of failures.
 
     Units, goals and, where `value` of all successes is given, a value are fitted anew to each three
     folds; failures are measured by all successes. An episode whose object no success (in another fold)
-    has is left out. UserError: fewer than 9 successes are left.
+    has is left out. `towers`: the name of those that embedded the images. UserError: fewer than 9
+    successes are left.
     """
     by_object = sorted(successes, key=lambda e: e.object)  # each object in as many folds as can be
     costs: list[float] = []
@@ -156,7 +161,7 @@ def fit_judge(
         others = [e for i, e in enumerate(by_object) if i % _FOLDS != fold]
         refitted = None if value is None else fit_value(others, value.config.task)
         costs += _costs(by_object[fold::_FOLDS], others, refitted)
-    return Judge(tuple(costs), tuple(_costs(failures, successes, value)))
+    return Judge(tuple(costs), tuple(_costs(failures, successes, value)), towers)
 
 
 def _costs(
