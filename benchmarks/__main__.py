@@ -82,6 +82,7 @@ BENCHMARKS = {
     ),
     "loader-speed": ("speed.loader_speed", "training samples a second, beside lerobot's loader"),
     "policy-latency": ("speed.policy_latency", "time of a plan, stage by stage"),
+    "scaling": ("speed.scaling", "episodes a second against Ray workers, beside a model"),
     "tactile-speed": ("speed.tactile_speed", "simulated tactile images a second"),
 }
 """Module in `benchmarks` and meaning of each benchmark."""

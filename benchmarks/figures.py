@@ -258,6 +258,13 @@ def properties(metrics: Metrics) -> str:
     return "; ".join(f"{k} {v:.2f}" + (f" ({most:.2f})" if most else "") for (k, v), most in named)
 
 
+def scaling(metrics: Metrics) -> str:
+    """Episodes a second with most workers, and the model's of a number of workers left out of it, of measured."""
+    rates, left_out = metrics["rates"], str(metrics["predicted"])
+    most, share = max(rates, key=int), metrics["model"][left_out] / rates[left_out]
+    return f"{rates[most]:.0f}/s with {most} workers; model {share:.2f} of measured"
+
+
 def faults(metrics: Metrics) -> str:
     """Faults that lose no episode, and the longest time to rest."""
     rows = metrics["rows"]

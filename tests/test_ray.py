@@ -6,6 +6,7 @@ import multiprocessing
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from in_process import in_process_workers
+from in_process import in_process_workers, run_benchmark
 
+from benchmarks.speed import scaling
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
@@ -61,6 +63,29 @@ def test_a_node_may_be_lost(cluster: Any, tmp_path: Path, monkeypatch: pytest.Mo
     main([*curves, str(tmp_path / "there"), "--ray", cluster.address])
     here, there = (pq.read_table(tmp_path / out / FRAMES) for out in ("here", "there"))
     assert here.num_rows and here.equals(there)
+
+
+def test_scaling_counts_from_when_the_workers_have_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On local processes, which stand in for a cluster's; rates by a clock of its own."""
+    with monkeypatch.context() as patch, in_process_workers():
+        patch.setattr(scaling, "_cluster", nullcontext)
+        sizes = "--counts 1 --predicted 2 --seconds 0.01 --rounds 1 --items 2 --out"
+        run_benchmark("scaling", *sizes.split(), tmp_path)
+    told = json.loads((tmp_path / "metrics.json").read_text())
+    most = 1 / sum(1 / told["ceilings"][what] for what in ("writer", "object store"))
+    assert told["model"]["2"] == pytest.approx(min(2 / (0.01 + told["added"]), most))
+    now = 0.0
+
+    def results() -> Iterator[int]:
+        nonlocal now
+        for i in range(6):  # two workers take 10 s to begin, then 1 s for each item
+            now += 10 if i == 0 else i % 2 == 0
+            yield i
+
+    monkeypatch.setattr(scaling.time, "perf_counter", lambda: now)
+    assert scaling._rate(results(), 2, scaling._go_through) == pytest.approx(2)
 
 
 def test_errors_are_the_same(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
