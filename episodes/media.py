@@ -14,6 +14,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
+from touchgoal.control.sensors.clip import rgb_image
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
@@ -97,7 +98,7 @@ def decode_video(
                 if frame is None or position > target:
                     raise UserError(f"the video has no frame {target}")
                 if position == target:
-                    images[row] = convert.reformat(frame, format="rgb24").to_ndarray()
+                    images[row] = rgb_image(convert, frame)
     return images[np.searchsorted(wanted, np.asarray(frames, np.int64))]
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import av
 import av.error
 import numpy as np
-from av.video.reformatter import VideoReformatter
+from av.video.reformatter import Colorspace, VideoReformatter
 from jaxtyping import UInt8
 
 from touchgoal.runtime.errors import UserError
@@ -174,7 +174,14 @@ def _video_frames(path: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         for i, frame in enumerate(container.decode(video=0)):
             if i == 0:
                 _check_format(frame, path)
-            yield _upright(convert.reformat(frame, format="rgb24").to_ndarray(), frame, path)
+            yield _upright(rgb_image(convert, frame), frame, path)
+
+
+def rgb_image(convert: VideoReformatter, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a decoded frame as RGB."""
+    # asked by default, PyAV before 17 takes BT.709 for BT.601 and the full range for the limited one
+    asked = {"src_color_range": frame.color_range, "dst_colorspace": Colorspace.ITU601}
+    return convert.reformat(frame, format="rgb24", **asked).to_ndarray()
 
 
 def _check_format(frame: av.VideoFrame, path: Path) -> None:
