@@ -51,14 +51,14 @@ done
 policy maze-half-aligned --share 0.5 --encoder gelsight_mini_markers --touch-input embedding
 policy maze-half-shipped --share 0.5 --encoder gelsight_mini_markers_mae --touch-input embedding
 policy maze-half-wrench --share 0.5 --encoder gelsight_mini_markers_mae
-policy maze-half-end-to-end --share 0.5 --end-to-end
+policy maze-half-end-to-end --share 0.5 --encoder end-to-end
 
 # Of all the demonstrations, three training seeds: the embedding of the least validation
 # loss above, the wrench read out of it, and touch learned with the policy.
 for seed in 0 1 2; do
     policy "maze-all-shipped-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae --touch-input embedding
     policy "maze-all-wrench-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae
-    policy "maze-all-end-to-end-$seed" --seed "$seed" --end-to-end
+    policy "maze-all-end-to-end-$seed" --seed "$seed" --encoder end-to-end
 done
 
 # The table by data, touch and head (records bead-maze-embedding, -wrench and -learned): a tenth, half and all of
@@ -68,7 +68,7 @@ sampled=(--head mlp --sampler.loss absolute --action-share 0.98)
 declare -A touches=(
     [embedding]="--encoder gelsight_mini_markers_mae --touch-input embedding"
     [wrench]="--encoder gelsight_mini_markers_mae"
-    [end-to-end]="--end-to-end"
+    [end-to-end]="--encoder end-to-end"
 )
 for share in 0.1 0.5 1; do
     for touch in embedding wrench end-to-end; do

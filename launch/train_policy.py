@@ -60,6 +60,7 @@ _SIGHT = {
 }
 
 
+_END_TO_END = Path("end-to-end")
 _PROJECTION_DIM = {"default": 64, "sight": 64, "paper": 256}  # width of the touch projection
 _WARMUP_STEPS = {"default": 500, "sight": 300, "paper": 500}
 
@@ -107,9 +108,8 @@ class Config(TrainingOptions):
     """Task of the episodes; default: the one they name. Snapshots are tried in a simulated task; of any
     other, which is known by its recordings alone, the last one is taken."""
     encoder: Path | None = None
-    """Frozen touch encoder: a folder (train-encoder), or the name of a shipped one; default: none."""
-    end_to_end: bool = False
-    """Train a touch ViT jointly with the policy, instead of a frozen encoder."""
+    """Frozen touch encoder: a folder (train-encoder), or the name of a shipped one; or end-to-end, a touch
+    ViT that is trained with the policy. Default: none."""
     cameras: tuple[str, ...] = ()
     """Cameras that the policy reads at every plan, such as front wrist; default: none. A frozen image
     encoder's feature maps tell it the next key pose: where the hand will be when the gripper next
@@ -183,12 +183,11 @@ def main(config: Config) -> None:
     from touchgoal.runtime.json_file import write_json
 
     check_run(config, config.out)
-    if config.end_to_end and config.encoder:
-        raise UserError("--end-to-end and --encoder exclude each other: leave out one")
     if config.cameras and config.estimator:
         raise UserError("--cameras and --estimator exclude each other: leave out one")
-    touch = load_touch(config.encoder) if config.encoder else None
-    parts = {TOUCH: find_encoder(config.encoder, published=False)} if config.encoder else {}
+    frozen = None if config.encoder == _END_TO_END else config.encoder
+    touch = load_touch(frozen) if frozen else None
+    parts = {TOUCH: find_encoder(frozen, published=False)} if frozen else {}
     if config.estimator:
         load_pose_estimator(config.estimator)
         parts[ESTIMATOR] = config.estimator
@@ -206,8 +205,7 @@ def main(config: Config) -> None:
     task = training_data.find_task(chosen, config.task)
     simulated = cast(TaskName, task) if task in TASKS else None
     trials = config.trials if simulated else 0
-    reads_touch = config.encoder or config.end_to_end
-    sensor = training_data.common_sensor(chosen) if reads_touch else ""
+    sensor = training_data.common_sensor(chosen) if config.encoder else ""
     env = _env(config.env, simulated, sensor) if simulated else None
     policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
     for one in sets:
@@ -270,7 +268,7 @@ def _policy_config(
         watches_novelty=config.refuse_unknown_touch,
         touch_noise=config.touch_noise,
         position_noise=config.position_noise,
-        end_to_end=EndToEndConfig() if config.end_to_end else None,
+        end_to_end=EndToEndConfig() if config.encoder == _END_TO_END else None,
         images=_image_input(config, episodes),
         proprioception=(*columns, *ESTIMATED) if config.estimator else columns,
         representation=config.representation,

@@ -17,13 +17,7 @@ from touchgoal.encoders.towers.towers import OfflineTowers, Towers, load_towers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.curves import Curves
-from touchgoal.rewards.distance.normalizer import (
-    NORMALIZER,
-    REMEDY,
-    DistanceNormalizer,
-    EmbeddingSource,
-    scene_of,
-)
+from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNormalizer, scene_of
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.features.embedding_cache import embed_end, embed_trajectory
@@ -110,8 +104,8 @@ class Reward:
         self._encoder, self._towers, self._plain, self._device = encoder, towers, plain, device
         self._normalizer = normalizer  # one read, or "encoder", "none", or None: by the scene
         self._folder: Path | None = None  # of the given normalizer
-        self._name = "the given normalizer"
-        self._judged: EmbeddingSource | None = None  # what a judge was fitted on
+        self._name, self._judges = "the given normalizer", False
+        self.camera, self._feels = FRONT, True  # of a judge: what it was fitted on
         if isinstance(normalizer, str | Path) and str(normalizer) not in ("encoder", "none"):
             self._normalizer = DistanceNormalizer.load(Path(normalizer))
             self._name, self._folder = str(normalizer), Path(normalizer).parent
@@ -129,13 +123,9 @@ class Reward:
         folder = find_judge(judge)
         goal, towers = folder / GOAL_FILE, Judge.load(folder / JUDGE).towers or None
         found = cls(GoalFile(goal), encoder=encoder, towers=towers, normalizer=folder / NORMALIZER)
-        found._judged = SuccessfulEnds.load(goal).made_with
+        made_with, found._judges = SuccessfulEnds.load(goal).made_with, True  # by the parts alone
+        found.camera, found._feels = made_with.camera or FRONT, bool(made_with.encoder)
         return found
-
-    @property
-    def camera(self) -> str:
-        """Key of the camera that a judge was fitted on; without a judge the front one."""
-        return (self._judged and self._judged.camera) or FRONT
 
     @overload
     def __call__(
@@ -204,8 +194,8 @@ class Reward:
         `goals` stand in for the reward's own. UserError: whatever would stop the measurement.
         """
         specs = goals or self.goals or [OwnFrame()]
-        if self._judged is not None:
-            sides = inputs.sides if self._judged.encoder else ()
+        if self._judges:
+            sides = inputs.sides if self._feels else ()
             inputs = replace(inputs, sides=sides, camera=self.camera)
         towers = self._towers
         together = towers not in (None, OfflineTowers.name)
@@ -298,7 +288,7 @@ class Reward:
                 found = DistanceNormalizer.load(path)
         if found is not None:
             own = same_episode(goals)
-            without = () if self._plain else ("image", "tactile") if self._judged else ("tactile",)
+            without = () if self._plain else ("image", "tactile") if self._judges else ("tactile",)
             unfit = found.mismatch(embedder.made_with, goals, own, without)
             if given is None and found.scene != inputs.scene:
                 unfit = (

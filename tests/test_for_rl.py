@@ -93,7 +93,7 @@ def test_several_at_once_with_touch() -> None:
 @pytest.mark.slow
 def test_benchmark_shaping(tmp_path: Path) -> None:
     """The scripted success is paid by both rewards; trainings on file are not made anew."""
-    sizes = "--steps 20 --every 10 --trials 1 --goals 2 --seeds 1"
+    sizes = "--decisions 20 --every 10 --trials 1 --goals 2 --seeds 1"
     run_benchmark("shaping", *sizes.split(), "--out", tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert [len(curve) for curves in metrics["curves"].values() for curve in curves] == [2, 2]

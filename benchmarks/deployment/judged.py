@@ -1,7 +1,7 @@
 """Verdicts of a judge on deployments over libfranka in lock-step, whose truth only this benchmark reads.
 
-A policy places objects and is ended by the judge, or by time; other runs fail on purpose: the expert
-places the object beside its goal, or grasps beside the object, and the policy's time is cut short.
+A policy does its task and is ended by the judge, or by time; other runs fail on purpose: the policy's time is
+cut short, and in pick-and-place the expert places the object beside its goal, or grasps beside the object.
 """
 
 import json
@@ -11,19 +11,22 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from benchmarks.deployment.deployed_episode import REFUSED, Deployment, Scene, deploy, deployed_twin
 from benchmarks.options import CORES, BenchmarkOptions
 from benchmarks.papers.reward_objects import TRAINING_OBJECTS
+from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.control.cell.twin_client import ask_twin
+from touchgoal.policies.evaluation.evaluate import trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.rewards.judging.judge import SHIPPED_JUDGE, find_judge
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Positive, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
+from touchgoal.sim_envs.config import BeadMazeConfig
 
 Kind = Literal["policy", "beside", "missed", "cut short"]
 _BESIDE = 0.04, 0.08  # m from the goal, or from the grasp
@@ -33,12 +36,14 @@ _BESIDE = 0.04, 0.08  # m from the goal, or from the grasp
 class Config(BenchmarkOptions):
     """Options of benchmark deploy-judged."""
 
+    task: SimulatedTask = "pick-place"
+    """Task; in the bead maze the wires are those of tests."""
     judge: str = SHIPPED_JUDGE
     """Judge, named as for touchgoal judge."""
     policy: str = "shipped"
     """Policy, named as for deploy."""
     objects: tuple[str, ...] = TRAINING_OBJECTS
-    """Objects, taken in turn: those of the judge's successes."""
+    """Objects of pick-and-place, taken in turn: those of the judge's successes."""
     episodes: Count = 40
     """Deployments of the policy."""
     failures: Count = 10
@@ -64,10 +69,18 @@ class Judged:
 
 def run(config: Config) -> dict[str, Any]:
     """Deploy, and compare the verdicts with the simulator's."""
-    counts = {k: config.episodes if k == "policy" else config.failures for k in get_args(Kind)}
+    counts: dict[Kind, int] = {"policy": config.episodes}
+    if config.task == "pick-place":
+        counts |= {"beside": config.failures, "missed": config.failures}
+    counts["cut short"] = config.failures
     kinds = [kind for kind, count in counts.items() for _ in range(count)]
+    items = config.objects
+    if config.task == "bead-maze":
+        specs = trial_specs(BeadMazeConfig(split="test"), len(kinds), config.seed)
+        items = [str(next(iter((spec.options or {}).values()))) for spec in specs]
+    scenes = [Scene(config.task, config.seed + k, items[k % len(items)]) for k in range(len(kinds))]
     with ThreadPoolExecutor(config.workers) as pool:
-        done = pool.map(partial(_deploy, config), enumerate(kinds))
+        done = pool.map(partial(_deploy, config), enumerate(zip(kinds, scenes, strict=True)))
         deployed = list(track(done, "deploying", "deployment", total=len(kinds)))
     rows = [row for row in deployed if row.verdict != REFUSED]
     lines = [f"{'truly':<10}{'runs':>5}{'told so [95 % Wilson]':>24}  other verdicts"]
@@ -88,19 +101,16 @@ def run(config: Config) -> dict[str, Any]:
     return {"table": "\n".join(lines), "deployments": [asdict(row) for row in deployed]}
 
 
-def _deploy(config: Config, job: tuple[int, Kind]) -> Judged:
-    number, kind = job
-    item = config.objects[number % len(config.objects)]
-    scene = Scene("pick-place", config.seed + number, item)
+def _deploy(config: Config, job: tuple[int, tuple[Kind, Scene]]) -> Judged:
+    number, (kind, scene) = job
     with TemporaryDirectory() as name:
         folder = Path(name)
         with deployed_twin(scene, True, folder, number) as cell:
             table = json.loads(cell.read_text())
-            task, layout = table["task"], ask_twin(table["task"]["twin"], "truth")["layout"]
-            task |= {
-                "judge": str(find_judge(config.judge).resolve()),
-                **_changes(kind, layout, scene.seed),
-            }
+            task = table["task"]
+            task["judge"] = str(find_judge(config.judge).resolve())
+            if kind in ("beside", "missed"):
+                task |= _changes(kind, ask_twin(task["twin"], "truth")["layout"], scene.seed)
             cell.write_text(json.dumps(table))
             policy = "expert" if kind in ("beside", "missed") else config.policy
             seconds = config.seconds / 4 if kind == "cut short" else config.seconds
@@ -115,8 +125,6 @@ def _deploy(config: Config, job: tuple[int, Kind]) -> Judged:
 
 def _changes(kind: Kind, layout: dict[str, Any], seed: int) -> dict[str, Any]:
     """Return the keys of the cell file's task that make an expert's run fail on purpose."""
-    if kind not in ("beside", "missed"):
-        return {}
     rng, (x, y, *grasp), goal = np.random.default_rng(seed), layout["grasp"], layout["goal"]
     angle = rng.uniform(0, 2 * np.pi)
     dx, dy = rng.uniform(*_BESIDE) * np.array([np.cos(angle), np.sin(angle)])

@@ -1,7 +1,7 @@
 """Soft actor-critic on lift-and-hold: the sparse reward alone, and shaped by the fall of the cost.
 
 The hand starts open around the object's top. Lifting the object by 2 cm and holding it there for a
-quarter of a second pays 1 and ends the episode; chance does so in 6 of 100 episodes. A step is 0.2 s. The
+quarter of a second pays 1 and ends the episode; chance does so in 6 of 100 episodes. An action lasts 0.2 s. The
 shaped reward adds gamma (1 - c') - (1 - c), with c the cost to the ends of scripted successes: potential-based
 shaping (Ng 1999) with 1 - c as the potential, 0 where an episode begins. The policy reads the hand's place,
 width and force; touch reaches it through the cost alone. Needs stable-baselines3, which is in the `dev` extra.
@@ -44,7 +44,7 @@ from touchgoal.sim_envs.pick_place import PickPlace
 
 _LIFTED = 0.02  # m
 _ABOVE, _ASIDE = 0.01, 0.005  # m of the hand from its grasp at the start; beside it at most
-_TICKS = 4  # of a step: an arm that changes its mind at every tick hardly ever closes its hand
+_TICKS = 4  # of an action: an arm that changes its mind at every tick hardly ever closes its hand
 _SPEED = 0.1 / CONTROL_HZ  # m a tick of an action of 1 along each axis
 _PLACE = {"start": (0.5, 0.0), "goal": (0.5, 0.15)}  # m: images of the goals must be comparable
 SCRIPT = [[0, 0, -0.5, 1]] + [[0, 0, 0, -1]] * 3 + [[0, 0, 1, -1]] * 6  # actions of a success
@@ -62,19 +62,19 @@ class Config(BenchmarkOptions):
     """Rewards to train with."""
     seeds: Count = 5
     """Trainings of each reward, each with another seed."""
-    steps: Count = 3000
-    """Steps of a training, of 0.2 s."""
+    decisions: Count = 3000
+    """Decisions of a training, each for 0.2 s."""
     every: Count = 250
-    """Steps between two evaluations."""
+    """Decisions between two evaluations."""
     trials: Count = 20
     """Episodes of an evaluation, without exploration; the same for all."""
     goals: Count = 5
     """Scripted successes that give the goals and the units of the cost."""
     gamma: Fraction = 0.95
-    """Discount of a step."""
+    """Discount of a decision."""
     entropy: Positive = 0.02
     """Coefficient of the entropy at the start. From 1, Stable-Baselines3's own, nothing was learnt in 6000
-    steps: it outweighs a reward of 1."""
+    ticks: it outweighs a reward of 1."""
     lr: Positive = 1e-3
     """Learning rate."""
     env: PickPlaceConfig = PickPlaceConfig(objects=("wooden_block",), cameras=(), max_seconds=3.0)
@@ -133,24 +133,27 @@ class HandControl(gym.Wrapper):
 
     def step(self, action: np.ndarray) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
         """Move the hand upright, and never below its grasp: it could press on the table."""
-        for _ in range(_TICKS):
-            observation, paid, ended, late, info = self._hand.step(self._joints(action))
-            self.seen.append(observation)
+        paid, ended, late, info = self._tick(action)
+        for _ in range(_TICKS - 1):
             if ended or late:
                 break
+            paid, ended, late, info = self._tick(action)
         if self._meter is not None:
             before, self._cost = self._cost, self._measure(self._meter)
             paid += self._gamma * (1 - self._cost) - (1 - before)
         return self._vector(), float(paid), ended, late, info
 
-    def _joints(self, action: np.ndarray) -> Float[np.ndarray, " n"]:
+    def _tick(self, action: np.ndarray) -> tuple[float, bool, bool, dict[str, Any]]:
         hand = self._hand
         position, R = hand.kinematics.forward(hand.command)
         shift = _SPEED * np.clip(action[:3], -1, 1)
         shift[2] = max(shift[2], self._start[2] - _ABOVE - position[2])
         change = np.append(shift, R @ rotation_vector(R.T @ self._upright) / 4)
         width = (action[3] + 1) / 2 * hand.robot.tool.stroke[1]
-        return np.append(hand.kinematics.joint_change(hand.command, change), width)
+        joints = np.append(hand.kinematics.joint_change(hand.command, change), width)
+        observation, paid, ended, late, info = hand.step(joints)
+        self.seen.append(observation)
+        return paid, ended, late, info
 
     def _measure(self, meter: CostMeter) -> float:
         for observation in self.seen[-_TICKS:]:
@@ -180,9 +183,9 @@ def run(config: Config) -> dict[str, Any]:
             list(track(results, "training", "run", total=len(missing)))
         read = [parse_json(file.read_bytes()) for file in files]
     curves = {arm: read[i * config.seeds :][: config.seeds] for i, arm in enumerate(config.arms)}
-    lines = [f"{'steps':>6}  " + "".join(f"{arm:<30}" for arm in config.arms)]
+    lines = [f"{'decisions':>9}  " + "".join(f"{arm:<30}" for arm in config.arms)]
     for i, now in enumerate(zip(*read, strict=True)):
-        lines.append(f"{(i + 1) * config.every:>6}  ")
+        lines.append(f"{(i + 1) * config.every:>9}  ")
         for k in range(len(config.arms)):
             each = now[k * config.seeds :][: config.seeds]
             rate = SuccessRate(sum(each), config.trials * config.seeds)
@@ -227,7 +230,7 @@ def _train(config: Config, out: Path, job: tuple[Arm, int]) -> None:
     model = SAC(
         "MlpPolicy", env, config.lr, gamma=config.gamma, ent_coef=entropy, seed=seed, device="cpu"
     )
-    for _ in range(config.steps // config.every):
+    for _ in range(config.decisions // config.every):
         model.learn(config.every, reset_num_timesteps=False)
         curve.append(sum(_succeeds(model, trials, _TRIAL_SEED + k) for k in range(config.trials)))
     write_json(out / f"{arm}-{seed}.json", curve)
