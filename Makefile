@@ -126,9 +126,8 @@ pose-estimator: $(READY)
 # The task where touch decides: one policy for each choice of inputs, on the same demonstrations.
 FRAGILE := collect-demos --task fragile-carry --env.cameras front wrist
 CARRY := train-policy --data runs/fragile/train/episodes --validation runs/fragile/val/episodes --trials 0 \
-	--representation base_twist --position-noise 0 --arm-state commanded --observation-horizon 4 --head regression \
-	--train.lr 1e-3 --train.epochs 20
-TOUCH := --encoder gelsight_mini_markers_mae --touch-input embedding
+	--representation base_twist --position-noise 0 --head regression
+TOUCH := --encoder gelsight_mini_markers_mae
 fragile-carry: $(READY)
 	$(BIN)/touchgoal $(FRAGILE) --episodes 20 --seed 100000 --out runs/fragile/val
 	$(BIN)/touchgoal $(FRAGILE) --episodes 151 --out runs/fragile/train
@@ -168,8 +167,7 @@ pick-place-policy: RUN := runs/pick_place
 pick-place-policy: NO_IMAGES := --env.no-tactile --env.cameras
 pick-place-policy: LATE := $(NO_IMAGES) $(DEPLOYED)
 pick-place-policy: LEARN := train-policy --task pick-place --representation base_twist --position-noise 0 \
-	--arm-state commanded --observation-horizon 4 --train.lr 1e-3 --train.epochs 16 --train.snapshot-epochs 16 \
-	--estimator policies/weights/pick_place/estimator
+	--arm-state commanded --train.epochs 16 --train.snapshot-epochs 16 --estimator policies/weights/pick_place/estimator
 pick-place-policy: ROUND := --head regression
 pick-place-policy: $(READY)
 	$(call record,val,18,100000,--feedback $(LATE))
@@ -188,8 +186,8 @@ pick-place-policy: $(READY)
 # this perceptron 37 and, from another seed, 39. With longer training, the errors on validation wires rise.
 MAZE := --task bead-maze --env.n-wires 260 --env.start-angle 10 $(DEPLOYED)
 MAZE_VALIDATION := --task bead-maze --env.split validation --env.n-wires 16 --env.start-angle 10 $(DEPLOYED)
-MAZE_LEARN := train-policy --task bead-maze --representation body_twist --arm-state commanded --train.lr 1e-3 \
-	--env.start-angle 10 --observation-horizon 4 --train.snapshot-epochs 5 --refuse-unknown-touch
+MAZE_LEARN := train-policy --task bead-maze --arm-state commanded --env.start-angle 10 --train.snapshot-epochs 5 \
+	--refuse-unknown-touch
 MAZE_ROUND := --head regression --train.epochs 5
 define maze_rounds
 $(call correct,1,80,300000,$(MAZE))
@@ -197,14 +195,13 @@ $(call correct,2,80,400000,$(MAZE))
 $(call correct,3,80,500000,$(MAZE))
 endef
 maze-policy: RUN := runs/maze
-maze-policy: LEARN := $(MAZE_LEARN) --encoder gelsight_mini_markers_mae --touch-input embedding
+maze-policy: LEARN := $(MAZE_LEARN) --encoder gelsight_mini_markers_mae
 maze-policy: ROUND := $(MAZE_ROUND)
 maze-policy: $(READY)
 	$(call record,val,12,100000,$(MAZE_VALIDATION))
 	$(call record,train,160,0,$(MAZE))
 	$(maze_rounds)
-	$(call train,policy,$(LEARN) --head mlp --touch-noise 0.5 --sampler.loss absolute --train.epochs 3 \
-		--sampler.num-train-timesteps 5 --sampler.num-inference-steps 1 --action-share 0.98 $(BEST))
+	$(call train,policy,$(LEARN) --touch-noise 0.5 --train.epochs 3 --action-share 0.98 $(BEST))
 	rm -rf policies/weights/bead_maze && cp -r $(RUN)/policy/policy policies/weights/bead_maze
 	rm -r policies/weights/bead_maze/touch
 
@@ -225,7 +222,7 @@ maze-wrench-policy: $(READY)
 # The rod's slip and weight are felt: no cameras. 20 minutes on 2 cores.
 fragile-carry-policy: RUN := runs/fragile_carry
 fragile-carry-policy: LEARN := train-policy --task fragile-carry --representation base_twist --position-noise 0 \
-	--arm-state commanded --observation-horizon 4 --head regression --train.lr 1e-3 --train.epochs 20 --refuse-unknown-touch $(TOUCH)
+	--arm-state commanded --head regression --train.epochs 20 --refuse-unknown-touch $(TOUCH)
 fragile-carry-policy: $(READY)
 	$(call record,val,20,100000,--task fragile-carry)
 	$(call record,train,151,0,--task fragile-carry)

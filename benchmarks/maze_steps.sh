@@ -6,14 +6,13 @@ set -eu
 
 policy() { # name, options
     [ -d "runs/maze-steps/$1/policy" ] && return
-    touchgoal train-policy --task bead-maze --representation body_twist --arm-state commanded --train.lr 1e-3 \
-        --observation-horizon 4 --train.snapshot-epochs 5 --refuse-unknown-touch --touch-noise 0.5 --action-share 0.98 \
-        --encoder gelsight_mini_markers_mae --touch-input embedding --trials 0 --env.start-angle 10 --env.as-deployed \
+    touchgoal train-policy --task bead-maze --train.snapshot-epochs 5 --refuse-unknown-touch --touch-noise 0.5 \
+        --action-share 0.98 --encoder gelsight_mini_markers_mae --trials 0 --env.start-angle 10 --env.as-deployed \
         --data runs/maze/train/episodes --validation runs/maze/val/episodes "${@:2}" --out "runs/maze-steps/$1"
 }
 
-five=(--head mlp --sampler.num-train-timesteps 5 --sampler.loss absolute --train.epochs 3)
+five=(--train.epochs 3)
 policy one "${five[@]}" --sampler.num-inference-steps 1
 policy four "${five[@]}" --sampler.num-inference-steps 4
-policy flow --head mlp --sampler.kind flow --sampler.num-inference-steps 4 --sampler.loss absolute --train.epochs 3
+policy flow --sampler.kind flow --sampler.num-inference-steps 4 --train.epochs 3
 policy regression --head regression --train.epochs 5

@@ -41,33 +41,33 @@ pretrained.save(backbone, Path("runs/maze-untrained/encoder"), {"untrained": "ra
 EOF
 
 policy() { # name, options
-    train train-policy "$1" --task bead-maze --head regression --observation-horizon 4 --arm-state commanded \
-        --train.lr 1e-3 --train.epochs 5 --trials 0 "${@:2}"
+    train train-policy "$1" --task bead-maze --head regression --arm-state commanded \
+        --train.epochs 5 --trials 0 "${@:2}"
 }
 
 for name in untrained mae dino ijepa vjepa; do
-    policy "maze-half-$name" --share 0.5 --encoder "runs/maze-$name/encoder" --touch-input embedding
+    policy "maze-half-$name" --share 0.5 --encoder "runs/maze-$name/encoder"
 done
-policy maze-half-aligned --share 0.5 --encoder gelsight_mini_markers --touch-input embedding
-policy maze-half-shipped --share 0.5 --encoder gelsight_mini_markers_mae --touch-input embedding
-policy maze-half-wrench --share 0.5 --encoder gelsight_mini_markers_mae
+policy maze-half-aligned --share 0.5 --encoder gelsight_mini_markers
+policy maze-half-shipped --share 0.5 --encoder gelsight_mini_markers_mae
+policy maze-half-wrench --share 0.5 --encoder gelsight_mini_markers_mae --touch-input wrench
 policy maze-half-end-to-end --share 0.5 --encoder end-to-end
 
 # Of all the demonstrations, three training seeds: the embedding of the least validation
 # loss above, the wrench read out of it, and touch learned with the policy.
 for seed in 0 1 2; do
-    policy "maze-all-shipped-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae --touch-input embedding
-    policy "maze-all-wrench-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae
+    policy "maze-all-shipped-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae
+    policy "maze-all-wrench-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae --touch-input wrench
     policy "maze-all-end-to-end-$seed" --seed "$seed" --encoder end-to-end
 done
 
 # The table by data, touch and head (records bead-maze-embedding, -wrench and -learned): a tenth, half and all of
 # the demonstrations, one seed; of all of them diffusion, and flow on the embedding, with three. Regression on half
 # and all of them is above.
-sampled=(--head mlp --sampler.loss absolute --action-share 0.98)
+sampled=(--head mlp --action-share 0.98 --sampler.num-train-timesteps 100 --sampler.num-inference-steps 2)
 declare -A touches=(
-    [embedding]="--encoder gelsight_mini_markers_mae --touch-input embedding"
-    [wrench]="--encoder gelsight_mini_markers_mae"
+    [embedding]="--encoder gelsight_mini_markers_mae"
+    [wrench]="--encoder gelsight_mini_markers_mae --touch-input wrench"
     [end-to-end]="--encoder end-to-end"
 )
 for share in 0.1 0.5 1; do

@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 _PAPER = {
     "head": "published",
     "representation": "delta",
-    "touch_input": "embedding",
+    "arm_state": "measured",
+    "observation_horizon": 2,
     "touch_noise": 0.0,
     "position_noise": 0.0,
     "execution_horizon": 8,
@@ -49,20 +50,17 @@ _PAPER = {
 # Fifty demonstrations of a task of one's own, by cameras and touch.
 _SIGHT = {
     "cameras": ("front", "wrist"),
-    "touch_input": "embedding",
+    "arm_state": "measured",
+    "observation_horizon": 2,
     "touch_noise": 1.0,
     "trim_pauses": True,
-    "head": "mlp",
     "action_share": 0.98,
     "execution_horizon": 6,
     "train": TrainConfig(epochs=10, batch_size=64, lr=3e-3, snapshot_epochs=5),
     "sampler": SamplerConfig(loss="absolute"),
 }
-
-
 _END_TO_END = Path("end-to-end")
 _PROJECTION_DIM = {"default": 64, "sight": 64, "paper": 256}  # width of the touch projection
-_WARMUP_STEPS = {"default": 500, "sight": 300, "paper": 500}
 
 
 @checked_dataclass
@@ -124,20 +122,20 @@ class Config(TrainingOptions):
     """Folder of the run; the policy goes to its `policy/`."""
     share: Annotated[Fraction, RARE] = 1.0
     """Share of the episodes to train on, counted from the first."""
-    head: Head = "small"
-    """Denoiser of a diffusion policy: a U-Net (tiny, small, published) or a multilayer
-    perceptron (mlp), which trains faster; or regression, which predicts plans directly."""
+    head: Head = "mlp"
+    """Denoiser of a diffusion policy: a multilayer perceptron (mlp) or a U-Net (published, tiny), which trains
+    longer; or regression, which predicts plans directly."""
     representation: ActionRepresentation = "body_twist"
     """Actions as the network predicts them: delta (joint change of each control tick), relative
     (joint change since the plan's start), absolute (joint positions), base_twist or body_twist
     (displacement and rotation of the hand along the base's or the hand's axes). body_twist also
     gives the network the hand's motion along its own axes; with --estimator take base_twist."""
-    arm_state: ArmState = "measured"
-    """Arm state that the policy reads: measured, or commanded, which no delay affects; commanded
-    needs episodes with the column observation.command."""
-    touch_input: TouchInput = "wrench"
-    """Input from a frozen touch encoder: wrench (a small network trained on the simulator's pad
-    forces and torques), or embedding (a projection trained on the actions alone)."""
+    arm_state: ArmState | None = None
+    """Arm state that the policy reads: measured, or commanded, which no delay affects. Default: commanded
+    if the episodes have it, as observation.command."""
+    touch_input: TouchInput = "embedding"
+    """Input from a frozen touch encoder: embedding (a projection trained on the actions alone), or
+    wrench (a small network trained on the simulator's pad forces and torques)."""
     refuse_unknown_touch: bool = False
     """The policy stops once touch has been unlike all of the training for a second. For episodes in
     which an expert corrected a policy (make-policy): a limit from demonstrations alone also stops
@@ -150,13 +148,13 @@ class Config(TrainingOptions):
     action_share: Annotated[Fraction, RARE] = 1.0
     """Middle share of the actions that the network's range of -1 to 1 covers; below 1, rare large
     motions do not make all others tiny."""
-    observation_horizon: Annotated[Count, RARE] = 2
+    observation_horizon: Annotated[Count, RARE] = 4
     """Control ticks that the policy observes, the latest included."""
     execution_horizon: Count = 2
     """Control ticks of a plan that are executed before the next plan."""
     train: TrainConfig = TrainConfig()
     """Epochs, learning rate, batches."""
-    sampler: Annotated[SamplerConfig, RARE] = SamplerConfig()
+    sampler: Annotated[SamplerConfig, RARE] = SamplerConfig("ddim", 5, 1, "absolute")
     """Noise schedule and denoising of a diffusion policy."""
     trials: CountOrNone = 24
     """Number of validation episodes in which every snapshot is tried; 0 takes the last snapshot."""
@@ -227,8 +225,7 @@ def main(config: Config) -> None:
     windows, validation = (sequence_dataset.SequenceDataset(r, policy) for r in recordings)
     print(f"{len(windows)} windows of {len(rows[0])} episodes; {len(validation)} for validation")
     provenance = recipe(*sets) | {"episodes": len(rows[0])}
-    warmup = _WARMUP_STEPS[config.preset]
-    train(policy, windows, validation, config.train, out, config, provenance, warmup)
+    train(policy, windows, validation, config.train, out, config, provenance)
     if not is_first_process():
         return
     copy_parts(out / POLICY, parts)
@@ -252,7 +249,9 @@ def _policy_config(
     from touchgoal.policies.perception.end_to_end import EndToEndConfig
     from touchgoal.policies.perception.state_estimation import ESTIMATED
 
-    columns = ft.STATE, ft.TCP_POSE, *[ft.COMMAND] * (config.arm_state == "commanded")
+    usual = "commanded" if ft.COMMAND in episodes.features else "measured"
+    commanded = (config.arm_state or usual) == "commanded"
+    columns = ft.STATE, ft.TCP_POSE, *[ft.COMMAND] * commanded
     if config.hand_force or config.estimator:
         columns += (ft.WRENCH,)
     head = MLPConfig()

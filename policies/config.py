@@ -9,9 +9,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import FIXED, Count, Positive, checked_dataclass
 from touchgoal.sim_envs.config import USUAL_CAMERA, CameraPlacement
 
-Head = Literal["small", "published", "tiny", "mlp", "regression"]
-"""A diffusion head with a U-Net of that size or a multilayer perceptron, or one that predicts a plan
-directly."""
+Head = Literal["mlp", "regression", "published", "tiny"]
+"""A diffusion head with a multilayer perceptron or a U-Net of that size, or one that predicts a plan directly."""
 ArmState = Literal["measured", "commanded"]
 TouchInput = Literal["wrench", "embedding"]
 ActionRepresentation = Literal["delta", "relative", "absolute", "base_twist", "body_twist"]
@@ -65,11 +64,11 @@ class SamplerConfig:
 class TrainConfig:
     """Training of a policy."""
 
-    epochs: Count = 60
+    epochs: Count = 20
     """Passes over the data."""
     batch_size: Count = 256
     """Sequences in each step; all of them if there are fewer."""
-    lr: Positive = 5e-4
+    lr: Positive = 1e-3
     """Highest learning rate of AdamW, after a linear rise from 0 and before a cosine to 0."""
     snapshot_epochs: Count = 10
     """Epochs between two snapshots of the policy; the last epoch makes one, too."""

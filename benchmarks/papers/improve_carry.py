@@ -53,8 +53,8 @@ class Config(BenchmarkOptions):
     trials: Count = 100
     """Episodes of the policy before and of those after, the same for all."""
     train: str = (
-        "--representation base_twist --position-noise 0 --arm-state commanded --observation-horizon 4 --head "
-        "regression --train.lr 1e-3 --train.epochs 60 --encoder gelsight_mini_markers_mae --touch-input embedding"
+        "--representation base_twist --position-noise 0 --head regression --train.epochs 60 "
+        "--encoder gelsight_mini_markers_mae"
     )
     """Options of train-policy."""
     workers: Count = CORES

@@ -42,12 +42,16 @@ from touchgoal.sim_envs.config import PickPlaceConfig
 _ESTIMATOR = SHIPPED_POLICIES["pick-place"] / ESTIMATOR
 _TASK = PickPlaceConfig(objects=HELD_OUT_OBJECTS)
 _ACCEPTED = "accepted by "
-_KEPT = 0.8  # share of right ones that a limit accepts
+_KEPT, _NEARLY_ALL = (
+    0.8,
+    ", 9 of 10",
+)  # of the right ones are accepted, usually; and by rows named so
 Weights = Literal[
-    "none", "successes alone", "accepted by judge", "accepted by image", "accepted by tactile"
-]
-"""Weights of the demonstrations: none; 1 for successes, else 0; 1 where the end is no dearer than four of five
-right ones, else 0."""
+    "none", "successes alone", "2 of 3 successes", "accepted by judge", "accepted by judge, 9 of 10",
+    "accepted by image", "accepted by tactile",
+]  # fmt: skip
+"""Weights of the demonstrations: none; 1 for successes, all or two of three, else 0; 1 where the end is no dearer
+than four of five right ones, or nine of ten, else 0."""
 
 
 @checked_dataclass
@@ -143,12 +147,17 @@ def _weights(name: str, data: _Demonstrations, judge: Judge) -> np.ndarray | Non
         return None
     if name == "successes alone":
         return np.repeat(_good(data.recorded), lengths).astype(np.float32)
-    accepted = _accepted(judge, data, name.removeprefix(_ACCEPTED))
+    if name == "2 of 3 successes":
+        good = np.array(_good(data.recorded))
+        return np.repeat(good & (np.cumsum(good) % 3 > 0), lengths).astype(np.float32)
+    kept = 0.9 if name.endswith(_NEARLY_ALL) else _KEPT
+    curve = name.removeprefix(_ACCEPTED).removesuffix(_NEARLY_ALL)
+    accepted = _accepted(judge, data, curve, kept)
     return np.repeat(accepted, lengths).astype(np.float32)
 
 
-def _accepted(judge: Judge, data: _Demonstrations, curve: str) -> list[bool]:
-    """Return which episodes end no dearer than four of five right ones: by an end's cost, or a curve's."""
+def _accepted(judge: Judge, data: _Demonstrations, curve: str, kept: float) -> list[bool]:
+    """Return which episodes end no dearer than a share of right ones: by an end's cost, or a curve's."""
 
     def last(r: Recorded) -> float:
         if curve == "judge":
@@ -156,7 +165,7 @@ def _accepted(judge: Judge, data: _Demonstrations, curve: str) -> list[bool]:
         return float(judge.costs(judge.files.load(r), r.object)[curve][-1])
 
     right = [r for r, good in zip(data.right, _good(data.right), strict=True) if good]
-    limit = np.quantile([last(r) for r in right], _KEPT)
+    limit = np.quantile([last(r) for r in right], kept)
     return [last(r) <= limit for r in data.recorded]
 
 
@@ -208,10 +217,10 @@ def _try(policy: Path, trials: int) -> list[Trial]:
 
 
 def _imitation_table(rows: dict[str, list[dict[str, float]]], sizes: str, trials: int) -> str:
-    head = f"{'imitation weighted by':<24}{'windows used':>14}{'success [95 % Wilson]':>26}  of each seed"
+    head = f"{'imitation weighted by':<28}{'windows used':>14}{'success [95 % Wilson]':>26}  of each seed"
     lines = [sizes, head]
     for name, found in rows.items():
         won = [int(f["successes"]) for f in found]
         rate = SuccessRate(sum(won), trials * len(won))
-        lines.append(f"{name:<24}{found[0]['used']:>14.0%}{rate!s:>26}  {' '.join(map(str, won))}")
+        lines.append(f"{name:<28}{found[0]['used']:>14.0%}{rate!s:>26}  {' '.join(map(str, won))}")
     return "\n".join(lines)

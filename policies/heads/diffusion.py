@@ -16,7 +16,7 @@ from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.trainer import gather_batch
 from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.mlp import MLPConfig, MLPDenoiser, build_mlp
-from touchgoal.policies.heads.unet import PRESETS, UNet, UNetConfig
+from touchgoal.policies.heads.unet import UNet, UNetConfig
 
 # the network's step at flow time 1: its step embedding cannot resolve 0 to 1
 FLOW_TIME_SCALE = 100.0
@@ -90,7 +90,7 @@ def denoise(
 class DiffusionConfig:
     """Network and sampler of a diffusion head."""
 
-    denoiser: UNetConfig | MLPConfig = field(default_factory=lambda: PRESETS["small"])
+    denoiser: UNetConfig | MLPConfig = MLPConfig()
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
 
 

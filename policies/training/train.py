@@ -23,6 +23,7 @@ from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
 BETAS, WEIGHT_DECAY = (0.95, 0.999), 1e-6  # of AdamW, as in diffusion_policy
+_WARMUP_STEPS = 500  # as there; a tenth of a training that is shorter
 _SEEN = "touch", "state", "images", "maps"  # of a batch, by the policy as it acts
 _LEARNED = "actions", "noise", "wrench", "action_is_pad", "key_pose"  # and by the loss alone
 _VALIDATION_WINDOWS = 1024  # evenly spaced, for the losses
@@ -36,7 +37,6 @@ def train(
     out_dir: Path,
     options: TrainerOptions,
     recipe: dict[str, Any],
-    warmup_steps: int = 500,
 ) -> PolicyNetwork:
     """Train a policy; the moving average of its weights is the result.
 
@@ -49,7 +49,6 @@ def train(
         validation: windows of other episodes.
         out_dir: folder of a new run, or of the one to resume.
         recipe: JSON-able provenance of the episodes, written beside the weights.
-        warmup_steps: in which the learning rate rises; a tenth of the training if that is shorter.
     """
     network = untrained(policy, windows, options.seed)
     average = AveragedModel(network, multi_avg_fn=_update_average).eval().requires_grad_(False)
@@ -77,11 +76,11 @@ def train(
             config.lr,
             WEIGHT_DECAY,
             betas=BETAS,
-            max_warmup_steps=warmup_steps,
+            max_warmup_steps=_WARMUP_STEPS,
         ),
         identity={
             "train": asdict(config),
-            "warmup_steps": warmup_steps,
+            "warmup_steps": _WARMUP_STEPS,
             "policy": asdict(network.config),
             "data": [_checksum(windows), _checksum(validation)],
         },
