@@ -115,12 +115,13 @@ def grips_found(metrics: Metrics, trials: str) -> str:
 
 
 def learning_curves(metrics: Metrics) -> str:
-    """Success at the end of training and mean over all evaluations, all seeds together, by reward."""
+    """Success at the first and the last evaluation and mean over all, all seeds together, by reward."""
     found = []
     for arm, curves in metrics["curves"].items():
-        rate = SuccessRate(sum(c[-1] for c in curves), metrics["trials"] * len(curves))
-        evaluations = metrics["trials"] * sum(map(len, curves))
-        found.append(f"{arm} {rate}, throughout {sum(map(sum, curves)) / evaluations:.2f}")
+        of = metrics["trials"] * len(curves)
+        first, last = (SuccessRate(sum(c[k] for c in curves), of) for k in (0, -1))
+        mean = sum(map(sum, curves)) / (of * len(curves[0]))
+        found.append(f"{arm} {first} at first, {last} at last, throughout {mean:.2f}")
     return "; ".join(found)
 
 

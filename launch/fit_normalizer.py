@@ -55,6 +55,7 @@ class Config:
 def main(config: Config) -> None:
     """Check, embed, fit, and write normalizer.json."""
     from collections import Counter
+    from dataclasses import replace
 
     from touchgoal.episodes.keys import parse_keys
     from touchgoal.rewards.distance.fit_normalizer import fit_normalizer, separating
@@ -112,7 +113,7 @@ def main(config: Config) -> None:
     print(f"spread of successful ends by part: {units or 'none, for no two hold the same object'}")
     if config.judge:
         failed = [embed_end(embedder, t) for t in track(failures, "embedding failures", "episode")]
-        judge = fit_judge(embedded, failed, value, embedder.towers.name)
+        judge = replace(fit_judge(embedded, failed, value), towers=embedder.towers.name)
         judge.save(out / JUDGE)
         print(f"{judge}\nnext: touchgoal judge SET --judge {out}")
         return

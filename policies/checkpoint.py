@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from touchgoal.encoders.towers.goal_sentence import check_goal_sentence
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.config import POLICIES
@@ -91,7 +92,7 @@ class SavedPolicy:
         return bool(self.network().config.estimated)
 
     def with_target(self, target: str | None) -> "SavedPolicy":
-        """Return the policy with a target; UserError if that is empty, or the policy takes none."""
+        """Return the policy with a target; UserError: it is empty or negated, or the policy takes none."""
         if target is None:
             return self
         if not target.strip():
@@ -100,6 +101,7 @@ class SavedPolicy:
             )
         if not self.is_estimated:
             raise UserError(f"the policy in {self.directory} takes no target: leave it out")
+        check_goal_sentence(target)
         return replace(self, target=target)
 
     def network(self) -> PolicyNetwork:

@@ -123,7 +123,7 @@ class Reward:
         folder = find_judge(judge)
         goal, towers = folder / GOAL_FILE, Judge.load(folder / JUDGE).towers or None
         found = cls(GoalFile(goal), encoder=encoder, towers=towers, normalizer=folder / NORMALIZER)
-        made_with, found._judges = SuccessfulEnds.load(goal).made_with, True  # by the parts alone
+        found._judges, made_with = True, SuccessfulEnds.load(goal).made_with  # by the parts alone
         found.camera, found._feels = made_with.camera or FRONT, bool(made_with.encoder)
         return found
 
@@ -195,8 +195,8 @@ class Reward:
         """
         specs = goals or self.goals or [OwnFrame()]
         if self._judges:
-            sides = inputs.sides if self._feels else ()
-            inputs = replace(inputs, sides=sides, camera=self.camera)
+            camera = self.camera if self.camera in inputs.cameras else inputs.camera
+            inputs = replace(inputs, sides=inputs.sides if self._feels else (), camera=camera)
         towers = self._towers
         together = towers not in (None, OfflineTowers.name)
         if towers is not None and not isinstance(towers, str):

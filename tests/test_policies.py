@@ -229,6 +229,7 @@ def test_a_target_is_told_to_what_takes_one(capsys: pytest.CaptureFixture[str]) 
     assert "nothing says which of 3 objects is meant: add --target" in capsys.readouterr().err
     for name, task, target, message in (
         ("shipped", PickPlaceConfig(), " ", "the target is empty: name the object"),
+        ("shipped", PickPlaceConfig(), "not the red block", "hardly notices 'not'"),
         ("shipped", BeadMazeConfig(), "a bead", "takes no target"),
         ("expert", PickPlaceConfig(), "a red block", "the policy expert takes no target"),
     ):

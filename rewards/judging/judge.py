@@ -143,17 +143,13 @@ def _quantile(costs: Sequence[float], beyond: float) -> float:
 
 
 def fit_judge(
-    successes: Sequence[EmbeddedEpisode],
-    failures: Sequence[EmbeddedEpisode],
-    value: Value | None,
-    towers: str = "",
+    successes: Sequence[EmbeddedEpisode], failures: Sequence[EmbeddedEpisode], value: Value | None
 ) -> Judge:
     """Return the judge of successes, each measured by the other three of 4 folds, and of failures.
 
     Units, goals and, where `value` of all successes is given, a value are fitted anew to each three
     folds; failures are measured by all successes. An episode whose object no success (in another fold)
-    has is left out. `towers`: the name of those that embedded the images. UserError: fewer than 9
-    successes are left.
+    has is left out. UserError: fewer than 9 successes are left.
     """
     by_object = sorted(successes, key=lambda e: e.object)  # each object in as many folds as can be
     costs: list[float] = []
@@ -161,7 +157,7 @@ def fit_judge(
         others = [e for i, e in enumerate(by_object) if i % _FOLDS != fold]
         refitted = None if value is None else fit_value(others, value.config.task)
         costs += _costs(by_object[fold::_FOLDS], others, refitted)
-    return Judge(tuple(costs), tuple(_costs(failures, successes, value)), towers)
+    return Judge(tuple(costs), tuple(_costs(failures, successes, value)))
 
 
 def _costs(
