@@ -86,9 +86,7 @@ def test_a_hand_that_lets_go_is_judged_by_what_it_carried(embedder: EpisodeEmbed
         TACTILE_LEFT: frames[TACTILE_LEFT].copy(),
         WRENCH: np.zeros((40, 6), np.float32),
     }
-    unfelt[TACTILE_LEFT][33:36] = unfelt[TACTILE_LEFT][
-        32
-    ]  # put down so softly that no one feels it
+    unfelt[TACTILE_LEFT][33:36] = unfelt[TACTILE_LEFT][32]  # put down too softly to be felt
     let_go, holds, wrong, softly = (
         embedder.embed_chunks([replace(kept, frames=f)], 20, "one")
         for f in (frames, kept.frames, other, unfelt)
@@ -131,10 +129,8 @@ def test_fitted_judged_and_corrected(
     told = json.loads(Path("set/judged.json").read_text())
     assert told["9"]["verdict"] == "failure" and told["9"]["reasons"]
     assert Path("out/judged.html").read_text().count("<img") == 20
-    normalizer = DistanceNormalizer.load(
-        Path("fit/normalizer.json")
-    )  # of images that separate nothing
-    replace(normalizer, start={}, goal={}).save(Path("fit/normalizer.json"))
+    path = Path("fit/normalizer.json")  # of images that separate nothing
+    replace(DistanceNormalizer.load(path), start={}, goal={}).save(path)
     main([*judge, "parts"])
     assert Path("parts/judged.csv").read_text() == Path("out/judged.csv").read_text()
     with pytest.raises(SystemExit, match="run it in a terminal"):

@@ -27,7 +27,6 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.deployment import control_loop, preflight, scripted, session
 from touchgoal.control.deployment.control_loop import ControlLoop, Ending
-from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.deployment.hand import HeldObject
 from touchgoal.control.deployment.manual import ManualControl
 from touchgoal.control.deployment.observation import ObservationReader
@@ -185,10 +184,8 @@ def test_a_gel_pressed_too_deep_is_let_go_unless_the_object_would_fall(
         hold(cell, width, tick >= held_since)
         depth[:] = 2e-3 * (tick >= 15)
 
-    assert (
-        "gel indentation" in cell.run(each, width=width).reason
-        and cell.gripper.commands[-1] == sent
-    )
+    reason = cell.run(each, width=width).reason
+    assert "gel indentation" in reason and cell.gripper.commands[-1] == sent
 
 
 def test_missed_ticks_are_not_made_up_for() -> None:
@@ -357,10 +354,7 @@ def moves_of(actor: ScriptedActor) -> list[PlannedMove]:
 
 def test_what_pick_and_place_plans() -> None:
     planned = []
-    for height in (
-        0.05,
-        0.0,
-    ):  # the box's floor is 5.6 mm up, the fingers reach 16.5 mm below the TCP
+    for height in (0.05, 0.0):  # the box's floor is 5.6 mm up, the fingers reach 16.5 mm below
         place = PickPlacePoses((0.45, 0.0, height, 0.0), (0.5, 0.1))
         actor = scripted.pick_and_place(place, SAFETY, lambda: HOME)
         planned += moves_of(actor)
@@ -376,29 +370,6 @@ def test_what_pick_and_place_plans() -> None:
     start = scripted.start_move(HOME + 0.6 * E[0], 0.04, SAFETY, lambda: HOME)
     (path,) = [m.path.sample(1000) for m in moves_of(start) if m.path]
     assert 0.29 < np.abs(np.diff(path, axis=0)).max() * 1000 / (0.2 * 2.62) <= 0.3
-
-
-def test_the_follower_goes_along_the_wire_and_yields_across_it() -> None:
-    """25 mm/s, 2 mm/s for each newton, a quarter of a second of memory, at most 6 mm ahead."""
-    actor, command, (tcp, R) = WireFollower(20), HOME.copy(), KINEMATICS.forward(HOME)
-
-    def step(measured: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """Where the next command leads, along the hand's axes."""
-        nonlocal command
-        state = np.concatenate([measured, np.zeros(8)])
-        command = (
-            command + actor.act({ft.STATE: state, ft.WRENCH: np.append(R @ force, [0, 0, 0])})[:7]
-        )
-        return R.T @ (KINEMATICS.forward(command)[0] - tcp)
-
-    none, across = np.zeros(3), np.array([5.0, 10.0, 0.0])
-    assert not any(step(HOME, none).any() for _ in range(10)), "the hand closes for half a second"
-    assert step(HOME, across) == pytest.approx([1.25e-3, 1e-3, 0.0], abs=5e-6)
-    ahead = [np.linalg.norm(step(HOME, none)) for _ in range(8)]
-    assert ahead[-1] == pytest.approx(6e-3, abs=1e-5)
-    before, aside = actor._velocity @ R, np.append(2e-3 * R[:, 1], [0, 0, 0])
-    step(HOME + KINEMATICS.joint_change(HOME, aside), none)
-    assert actor._velocity @ R == pytest.approx(0.8 * before + [0, 8e-3, 0], abs=5e-5)
 
 
 @sides((0.9e-3, 1.1e-3))

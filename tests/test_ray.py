@@ -76,16 +76,11 @@ def test_scaling_counts_from_when_the_workers_have_begun(
     told = json.loads((tmp_path / "metrics.json").read_text())
     most = 1 / sum(1 / told["ceilings"][what] for what in ("writer", "object store"))
     assert told["model"]["2"] == pytest.approx(min(2 / (0.01 + told["added"]), most))
-    now = 0.0
-
-    def results() -> Iterator[int]:
-        nonlocal now
-        for i in range(6):  # two workers take 10 s to begin, then 1 s for each item
-            now += 10 if i == 0 else i % 2 == 0
-            yield i
-
-    monkeypatch.setattr(scaling.time, "perf_counter", lambda: now)
-    assert scaling._rate(results(), 2, scaling._go_through) == pytest.approx(2)
+    clock = iter(
+        [10, 10, 11, 11, 12, 12, 12]
+    )  # two workers begin within 10 s, then take 1 s an item
+    monkeypatch.setattr(scaling.time, "perf_counter", lambda: next(clock))
+    assert scaling._rate(range(6), 2, scaling._go_through) == 2
 
 
 def test_errors_are_the_same(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
