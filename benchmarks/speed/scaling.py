@@ -8,6 +8,7 @@ of W / (s + d) and 1 / (r + w): s is the simulation, d what Ray adds to an item,
 and w the seconds to receive and to write an episode. One number of workers is left out of it and predicted.
 """
 
+import os
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -116,6 +117,7 @@ def _cluster(workers: int) -> Iterator[str]:
         from ray.cluster_utils import Cluster
     except ImportError as error:
         raise UserError(f"scaling measures Ray: {install_extra('ray')}") from error
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # reports nothing to its makers
     cluster = Cluster(True, head_node_args={"num_cpus": workers, "include_dashboard": False})
     try:
         yield str(cluster.address)
