@@ -183,13 +183,13 @@ def run(config: Config) -> dict[str, Any]:
             list(track(results, "training", "run", total=len(missing)))
         read = [parse_json(file.read_bytes()) for file in files]
     curves = {arm: read[i * config.seeds :][: config.seeds] for i, arm in enumerate(config.arms)}
-    lines = [f"{'decisions':>9}  " + "".join(f"{arm:<30}" for arm in config.arms)]
+    lines = [f"{'decisions':>9}  " + "".join(f"{arm:<42}" for arm in config.arms)]
     for i, now in enumerate(zip(*read, strict=True)):
         lines.append(f"{(i + 1) * config.every:>9}  ")
         for k in range(len(config.arms)):
             each = now[k * config.seeds :][: config.seeds]
             rate = SuccessRate(sum(each), config.trials * config.seeds)
-            lines[-1] += f"{rate} ({', '.join(map(str, each))})".ljust(30)
+            lines[-1] += f"{rate} ({', '.join(map(str, each))})".ljust(42)
     return {"table": "\n".join(lines), "trials": config.trials, "curves": curves}
 
 
