@@ -260,10 +260,11 @@ def properties(metrics: Metrics) -> str:
 
 
 def scaling(metrics: Metrics) -> str:
-    """Episodes a second with most workers, and the model's of a number of workers left out of it, of measured."""
+    """Most episodes a second, the writer's ceiling, and the model's of a number of workers left out of it."""
     rates, left_out = metrics["rates"], str(metrics["predicted"])
-    most, share = max(rates, key=int), metrics["model"][left_out] / rates[left_out]
-    return f"{rates[most]:.0f}/s with {most} workers; model {share:.2f} of measured"
+    most, share = max(rates.values()), metrics["model"][left_out] / rates[left_out]
+    ceiling = metrics["ceilings"]["writer"]
+    return f"{most:.1f} at most, the writer alone {ceiling:.1f}; model {share:.2f} of measured"
 
 
 def faults(metrics: Metrics) -> str:
