@@ -153,7 +153,7 @@ def test_learning_the_bead_maze(here: Path, capsys: pytest.CaptureFixture) -> No
     run("train-policy", *both, *one, "--head", "tiny", "--trials", 0, "--encoder", "end-to-end",
         "--train.epochs", 1, "--observation-horizon", 3, "--sampler.loss", "squared", "--out", "jointly")  # fmt: skip
     jointly = checkpoint.load(Path("jointly/policy")).config
-    assert jointly.end_to_end and not jointly.touch and jointly.observation_horizon == 3
+    assert jointly.end_to_end and jointly.sensor and jointly.observation_horizon == 3
     other = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "policy/policy",
                     "--env.sensor", "gelsight_mini")  # fmt: skip
     assert "trained with the sensor gelsight_mini_markers" in other
