@@ -125,7 +125,7 @@ def test_learning_the_bead_maze(here: Path, capsys: pytest.CaptureFixture) -> No
         "--mae.batch-size", 8, "--out", "mae")  # fmt: skip
     learn = ("train-policy", *both, *one, "--head", "tiny", "--train.epochs", 2, "--trials", 1,
              "--train.snapshot-epochs", 1, "--env.max-seconds", 1)  # fmt: skip
-    run(*learn, "--encoder", "mae/encoder", "--out", "policy")
+    run(*learn, "--encoder", "mae/encoder", "--touch-input", "wrench", "--out", "policy")
     tried = json.loads(Path("policy/metrics.json").read_text())["snapshots"]
     assert set(tried) == {"epoch-0001", "epoch-0002"}
     capsys.readouterr()
@@ -135,7 +135,7 @@ def test_learning_the_bead_maze(here: Path, capsys: pytest.CaptureFixture) -> No
     run_benchmark("bead-maze", "--policies", "policy/policy", "--wires", 1, "--held-out", 0,
         "--demonstrations", 2, "--plan-ticks", "--env.max-seconds", 3, *one)  # fmt: skip
     printed = capsys.readouterr().out
-    assert "frozen touch (mae), 1 demos, shuffled" in printed and "zero motion" in printed
+    assert "(mae), 1 demos, denoised in 1 step, shuffled" in printed and "zero motion" in printed
     run_benchmark("policy-delay", "--policy", "expert", "--episodes", 1, "--delay", 0, "--jitter", 0, "--rates",
         30, "--workers", 1, "--out", "delay")  # fmt: skip
     run_benchmark("robustness", "--policy", "expert", "--tasks", "pick-place",
