@@ -42,10 +42,8 @@ from touchgoal.sim_envs.config import PickPlaceConfig
 _ESTIMATOR = SHIPPED_POLICIES["pick-place"] / ESTIMATOR
 _TASK = PickPlaceConfig(objects=HELD_OUT_OBJECTS)
 _ACCEPTED = "accepted by "
-_KEPT, _NEARLY_ALL = (
-    0.8,
-    ", 9 of 10",
-)  # of the right ones are accepted, usually; and by rows named so
+_KEPT = 0.8  # share of right ones that a limit accepts
+_NEARLY_ALL = ", 9 of 10"  # ends the names of rows whose limit accepts that share
 Weights = Literal[
     "none", "successes alone", "2 of 3 successes", "accepted by judge", "accepted by judge, 9 of 10",
     "accepted by image", "accepted by tactile",
