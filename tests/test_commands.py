@@ -97,9 +97,8 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert frames.shape[1:] == (264, 720, 3) and fps == 10
     printed = capsys.readouterr().out
     assert "fused" in printed and str(tmp_path / "curves.png") in printed
-    assert (
-        "sees and feels alone, says: " in printed and "says: success" not in printed
-    )  # it is cut short
+    # it is cut short
+    assert "sees and feels alone, says: " in printed and "says: success" not in printed
 
 
 def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -153,7 +152,8 @@ def test_learning_the_bead_maze(here: Path, capsys: pytest.CaptureFixture) -> No
     run("train-policy", *both, *one, "--head", "tiny", "--trials", 0, "--encoder", "end-to-end",
         "--train.epochs", 1, "--observation-horizon", 3, "--sampler.loss", "squared", "--out", "jointly")  # fmt: skip
     jointly = checkpoint.load(Path("jointly/policy")).config
-    assert jointly.end_to_end and jointly.sensor and jointly.observation_horizon == 3
+    assert jointly.end_to_end and not jointly.touch and jointly.observation_horizon == 3
+    assert jointly.sensor == "gelsight_mini_markers" and "squared" in str(jointly.head)
     other = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "policy/policy",
                     "--env.sensor", "gelsight_mini")  # fmt: skip
     assert "trained with the sensor gelsight_mini_markers" in other

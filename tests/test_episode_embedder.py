@@ -20,14 +20,7 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.rewards.distance.cost import compute_curves
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
-from touchgoal.rewards.goals import (
-    GoalImage,
-    Inputs,
-    Modality,
-    OwnFrame,
-    assign_goals,
-    parse_goal,
-)
+from touchgoal.rewards.goals import GoalImage, Inputs, Modality, OwnFrame, assign_goals, parse_goal
 from touchgoal.rewards.reward import Reward
 from touchgoal.runtime.errors import UserError
 

@@ -102,9 +102,13 @@ def test_benchmark_shaping(tmp_path: Path) -> None:
     )
     for env, least, most in ((sparse, 1.0, 1.0), (shaped, 1.3, 2.2)):
         env.reset(seed=0)
+        first = getattr(env, "_cost", 0.0)
         paid, ended, script = [], False, iter(shaping.SCRIPT)
         while not ended:
             _, reward, ended, *_ = env.step(np.array(next(script)))
             paid.append(reward)
         assert least <= sum(paid) <= most
+        if env is shaped:  # discounted, potentials telescope: only the first and the last count
+            gained = sum(0.95**t * r for t, r in enumerate(paid)) - 0.95 ** (len(paid) - 1)
+            assert gained == pytest.approx(0.95 ** len(paid) * (1 - env._cost) - (1 - first))
         assert (max(paid[:-1]) > 0.1) == (env is shaped), "the touch is paid at once"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_episode_embedder import embedder, recorded  # noqa: F401
 from test_reward_parts import embedded
-from test_towers import clip_directory  # noqa: F401
+from test_towers import make_clip
 
 from touchgoal.control.features import (
     FRONT,
@@ -102,10 +102,7 @@ def test_a_hand_that_lets_go_is_judged_by_what_it_carried(embedder: EpisodeEmbed
 
 
 def test_fitted_judged_and_corrected(
-    here: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture,
-    clip_directory: Path,  # noqa: F811
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     """Images alone; a person's word stays when the set is judged again; camera and towers are kept."""
     pytest.importorskip("transformers")
@@ -143,8 +140,10 @@ def test_fitted_judged_and_corrected(
     main([*judge, "again"])
     told = json.loads(Path("set/judged.json").read_text())
     assert [one["verdict"] for one in told.values() if one["by"] == "person"] == ["failure"]
-    main([*fit, "clip", "--towers", str(clip_directory), "--camera", "wrist"])
-    assert json.loads(Path("clip/judge.json").read_text())["towers"].startswith(str(clip_directory))
+    main([*fit, "clip", "--towers", str(make_clip(here / "towers")), "--camera", "wrist"])
+    assert json.loads(Path("clip/judge.json").read_text())["towers"].startswith(
+        str(here / "towers")
+    )
     main(["judge", "set", "--judge", "clip", "--out", "seen"])
     assert json.loads(Path("set/judged.json").read_text())["9"]["verdict"] == "failure"
 

@@ -48,15 +48,8 @@ from touchgoal.policies.sight.readout import CameraReadout, KeyPoseReadout, erro
             "111100",
             [None, None, None, 0, None, None],
         ),
-        (
-            [0.05, 0.0501, 0.05, 0.0502],
-            [2, 2],
-            0,
-            [1, 1, 3, 3],
-            [1, 1, 3, 3],
-            "0000",
-            [None] * 4,
-        ),  # noise on one width
+        # noise on one width
+        ([0.05, 0.0501, 0.05, 0.0502], [2, 2], 0, [1, 1, 3, 3], [1, 1, 3, 3], "0000", [None] * 4),
     ],
 )
 def test_a_key_pose_is_where_the_gripper_changes_or_the_episode_ends(
@@ -218,9 +211,8 @@ def test_a_plan_from_beside_ends_where_the_recorded_one_does() -> None:
     torch.testing.assert_close(back[: n // 2], plans[: n // 2])
     aside = (there - poses).abs().amax(1) > 0
     assert 0.3 < aside[n // 2 :].float().mean() < 0.7
-    turn = Rotation.from_rotvec(
-        back[:, -1, 3:6].numpy()
-    )  # from the hand beside to the recorded one
+    # from the hand beside to the recorded one
+    turn = Rotation.from_rotvec(back[:, -1, 3:6].numpy())
     left = (poses[:, :3] - plans[:, -1, :3]).numpy()
     np.testing.assert_allclose(there[:, :3] - back[:, -1, :3], turn.apply(left), atol=1e-6)
     np.testing.assert_allclose(there[:, 3:6], turn.apply(poses[:, 3:6].numpy()), atol=1e-6)

@@ -27,6 +27,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.deployment import control_loop, preflight, scripted, session
 from touchgoal.control.deployment.control_loop import ControlLoop, Ending
+from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.deployment.hand import HeldObject
 from touchgoal.control.deployment.manual import ManualControl
 from touchgoal.control.deployment.observation import ObservationReader
@@ -143,12 +144,8 @@ def silent_load_cell(age: float) -> Ending:
     [
         (lambda w: hand(w, 0.0), 0.0029, 0.0031, "does not follow"),  # closed
         (lambda w: hand(w, 0.08), 0.0601, 0.0599, "does not follow"),  # open
-        (
-            lambda s: hand(0.08, 0.0, s),
-            1.2,
-            1.4,
-            "does not follow",
-        ),  # 0.8 s of motion, 0.5 to react
+        # 0.8 s of motion, 0.5 to react
+        (lambda s: hand(0.08, 0.0, s), 1.2, 1.4, "does not follow"),
         (lambda v: hand(0.06, 0.0, 3.0, v), 0.82e-3, 0.7e-3, "does not follow"),  # 1 mm in 1.3 s
         (untouched, 1.3, 1.5, "neither fingertip"),
         (lambda n: slipping(n, 0.0), 1, 2, "lost its object"),
@@ -370,6 +367,26 @@ def test_what_pick_and_place_plans() -> None:
     start = scripted.start_move(HOME + 0.6 * E[0], 0.04, SAFETY, lambda: HOME)
     (path,) = [m.path.sample(1000) for m in moves_of(start) if m.path]
     assert 0.29 < np.abs(np.diff(path, axis=0)).max() * 1000 / (0.2 * 2.62) <= 0.3
+
+
+def test_the_follower_goes_along_the_wire_and_yields_across_it() -> None:
+    """25 mm/s, 2 mm/s for each newton, a quarter of a second of memory, at most 6 mm ahead."""
+    actor, command, (tcp, R) = WireFollower(20), HOME.copy(), KINEMATICS.forward(HOME)
+
+    def step(measured: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """Where the next command leads, along the hand's axes."""
+        state = np.concatenate([measured, np.zeros(8)])
+        command[:] += actor.act({ft.STATE: state, ft.WRENCH: np.append(R @ force, [0, 0, 0])})[:7]
+        return R.T @ (KINEMATICS.forward(command)[0] - tcp)
+
+    none, across = np.zeros(3), np.array([5.0, 10.0, 0.0])
+    assert not any(step(HOME, none).any() for _ in range(10)), "the hand closes for half a second"
+    assert step(HOME, across) == pytest.approx([1.25e-3, 1e-3, 0.0], abs=5e-6)
+    ahead = [np.linalg.norm(step(HOME, none)) for _ in range(8)]
+    assert ahead[-1] == pytest.approx(6e-3, abs=1e-5)
+    before, aside = actor._velocity @ R, np.append(2e-3 * R[:, 1], [0, 0, 0])
+    step(HOME + KINEMATICS.joint_change(HOME, aside), none)
+    assert actor._velocity @ R == pytest.approx(0.8 * before + [0, 8e-3, 0], abs=5e-5)
 
 
 @sides((0.9e-3, 1.1e-3))

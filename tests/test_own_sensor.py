@@ -171,9 +171,8 @@ def test_the_start_of_a_clip_is_no_untouched_gel_by_itself(
     np.testing.assert_array_equal(
         touch_background(np.stack(settling)), touch_background(np.stack(balls))
     )
-    early = np.stack(
-        [*balls[:2], *[balls[13]] * 16]
-    )  # a touch is no settling exposure, and ends it
+    # a touch is no settling exposure, and ends it
+    early = np.stack([*balls[:2], *[balls[13]] * 16])
     np.testing.assert_array_equal(untouched_frames(early), early[:2])
 
 

@@ -76,9 +76,7 @@ def test_scaling_counts_from_when_the_workers_have_begun(
     told = json.loads((tmp_path / "metrics.json").read_text())
     most = 1 / sum(1 / told["ceilings"][what] for what in ("writer", "object store"))
     assert told["model"]["2"] == pytest.approx(min(2 / (0.01 + told["added"]), most))
-    clock = iter(
-        [10, 10, 11, 11, 12, 12, 12]
-    )  # two workers begin within 10 s, then take 1 s an item
+    clock = iter([10, 10, 11, 11, 12, 12, 12])  # two workers begin within 10 s, then 1 s an item
     monkeypatch.setattr(scaling.time, "perf_counter", lambda: next(clock))
     assert scaling._rate(range(6), 2, scaling._go_through) == 2
 

@@ -107,9 +107,8 @@ def test_fingertips_go_at_half_a_metre_a_second(layer: ActionFilter) -> None:
     reach = np.linalg.norm(layer.monitored_points(home[None])[0, :, :2], axis=1).max()
     calm = replace(CALM, q=home, torque=np.zeros(home.size))
     for speed, limited in ((0.4999, False), (0.5001, True)):
-        turn = (
-            2 * np.arcsin(0.05 * speed / 2 / reach) * np.eye(home.size)[0]
-        )  # chords of that length
+        # chords of that length
+        turn = 2 * np.arcsin(0.05 * speed / 2 / reach) * np.eye(home.size)[0]
         state = fast.filter_action(SafetyState(home, 20 * turn), turn, calm)
         assert (state.active_limits == (Limit.TIP_SPEED,)) == limited
 

@@ -184,9 +184,8 @@ def test_a_twin_ends_with_what_started_it_and_says_its_pace(tmp_path: Path) -> N
     twin = f"{sys.executable} -m touchgoal.launch twin {arguments} --out {tmp_path}"
     wait = f"until [ -e {tmp_path}/cell.json ]; do sleep 0.1; done"
     log = tmp_path / "log"
-    hears = partial(
-        signal.signal, signal.SIGHUP, signal.SIG_DFL
-    )  # also where the tests run by nohup
+    # also where the tests run by nohup
+    hears = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)
     command = ["sh", "-c", f"{twin} >{log} 2>&1 </dev/null & {wait}"]
     subprocess.run(command, check=True, timeout=120, preexec_fn=hears)
     deadline = time.monotonic() + 30

@@ -33,9 +33,8 @@ for name in ("bead-maze", "pick-place"):
     rows, columns = policy.env_config().camera_size
     seen = blank | {ft.FRONT: np.zeros((rows, columns, 3), np.uint8)}
     seen |= dict.fromkeys(ft.TACTILE, np.full((240, 320, 3), 120, np.uint8))
-    if (
-        name == "pick-place"
-    ):  # nothing is seen in a black image: refused, until no trust is asked for
+    # nothing is seen in a black image: refused, until no trust is asked for
+    if name == "pick-place":
         with suppress(RefusedError):
             sys.exit(f"acts on a black image: {policy.act(seen)}")
         policy.reset()
