@@ -47,6 +47,16 @@ def mended(metrics: Metrics) -> str:
     return "; ".join(rows)
 
 
+def ended(metrics: Metrics) -> str:
+    """Share of each row's runs that end done, by the policy's word, and of those falsely called so."""
+    rows = []
+    for row in metrics["rows"]:
+        said = [end["success"] for end in row["ends"] if end["said"]]
+        rate = SuccessRate(sum(said), len(row["ends"]))
+        rows.append(f"{row['what']} {rate}, falsely {len(said) - sum(said)}")
+    return "; ".join(rows)
+
+
 def audited(metrics: Metrics) -> str:
     """Success by task: unchanged, and the most with any change of touch."""
     tasks: dict[str, list[SuccessRate]] = {}

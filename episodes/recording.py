@@ -30,6 +30,8 @@ from touchgoal.sim_envs.scene.filming import SceneRecorder
 from touchgoal.sim_envs.scene.objects import CATALOGUE, of_same_shape
 from touchgoal.sim_envs.tasks import make_env, make_expert
 
+_OUTCOME_SECONDS = 1.0  # s of rest after an actor is done, in which the simulator sees the outcome
+
 
 @dataclass(frozen=True)
 class EpisodeSpec:
@@ -117,8 +119,9 @@ def run(
     """Act until the episode ends, then rest as the config says; yield each tick with action and truth.
 
     The environment was just reset. An expert's actions, if given, are recorded in place of the
-    actor's.
+    actor's. An actor that is done, without an expert, ends the episode; a second of rest shows the outcome.
     """
+    rest = env.config.rest
     while True:
         action = np.asarray(actor.act(observation), np.float32)
         recorded = np.asarray(expert.act(observation), np.float32) if expert else action
@@ -126,9 +129,12 @@ def run(
         observation, _, terminated, truncated, info = env.step(action)
         if terminated or truncated or actor.given_up:
             break
+        if actor.done and expert is None:
+            rest = max(rest, _OUTCOME_SECONDS)
+            break
     still = np.append(np.zeros(env.n_joints), recorded[-1]).astype(np.float32)
     yield {**observation, ft.ACTION: still, **info}
-    for _ in range(round(env.config.rest * env.config.control_hz)):
+    for _ in range(round(rest * env.config.control_hz)):
         observation, _, _, _, info = env.step(still)
         yield {**observation, ft.ACTION: still, **info}
 

@@ -172,7 +172,7 @@ def main(config: Config) -> None:
     from touchgoal.encoders.training.run import check_run, open_sets, open_training, recipe
     from touchgoal.encoders.training.trainer import is_first_process
     from touchgoal.episodes.keys import parse_keys
-    from touchgoal.policies.checkpoint import ESTIMATOR, TOUCH
+    from touchgoal.policies.checkpoint import ESTIMATOR, POLICY_FORMAT, TOUCH
     from touchgoal.policies.perception.frozen_touch import load_touch
     from touchgoal.policies.perception.state_estimation import load_pose_estimator
     from touchgoal.policies.training import sequence_dataset, training_data
@@ -232,7 +232,9 @@ def main(config: Config) -> None:
     if env is not None and trials:
         scores = select(out, parts, lambda d: score(d, env, trials, workers))
         write_json(out / "metrics.json", {"snapshots": scores})
-    print(f"policy: {out / POLICY}")
+    told, of = POLICY_FORMAT.provenance(out / POLICY)["ended"]
+    how = f"ended {told} of {of} validation episodes by itself" if told else "does not tell the end"
+    print(f"policy: {out / POLICY}; it {how}")
     if simulated:
         print(f"next: touchgoal run-policy --task {task} --policy {out / POLICY}")
     else:
@@ -265,6 +267,7 @@ def _policy_config(
         touch_input=config.touch_input,
         touch_projection_dim=_PROJECTION_DIM[config.preset],
         watches_novelty=config.refuse_unknown_touch,
+        says_end=True,
         touch_noise=config.touch_noise,
         position_noise=config.position_noise,
         end_to_end=EndToEndConfig() if config.encoder == _END_TO_END else None,

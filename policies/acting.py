@@ -15,6 +15,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Planner
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.policies.heads.end import DONE_SECONDS
 from touchgoal.policies.network import NOVEL_SECONDS, ObservationBatch, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
@@ -105,6 +106,7 @@ class LearnedPolicy(Planner):
     def reset(self, seed: int = 0) -> None:
         """Begin an episode, whose first observation is untouched; `seed` is that of the plans' noise."""
         self._generator = torch.Generator().manual_seed(seed)
+        self.done = False
         self._begin({})
         self._regrasp, self.given_up = Regrasp(self.control_hz), ""
         self._recent: list[Observation] = []
@@ -116,7 +118,7 @@ class LearnedPolicy(Planner):
         self._first = first
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
         self._maps: tuple[Observation, Tensor] | None = None  # the latest embedded camera images
-        self._novel_plans = 0  # in a row
+        self._novel_plans = self._done_plans = 0  # in a row
         self._key_pose = KeyPoseAverage(self.execution_horizon / self.control_hz)
         self._width: float | None = None  # of the gripper, where the next plan begins, m
 
@@ -155,6 +157,7 @@ class LearnedPolicy(Planner):
             self._refuse_novel(batch)
             rest = self._generator, self._width, self._key_pose
             actions = self._network.plan(batch, *rest)[0].numpy()
+            self._notice_end(batch)
             # The last action of a plan comes a tick and `execution_horizon` ticks after its
             # observation. The whole motion is done where no age is known.
             reaction = (1 + self.execution_horizon) / self.control_hz
@@ -192,6 +195,12 @@ class LearnedPolicy(Planner):
                 f"for a second touch has been unlike all of the training ({novelty:.1f} times "
                 "as far from it as accepted): look for what has changed since the recordings"
             )
+
+    def _notice_end(self, batch: ObservationBatch) -> None:
+        """Be done once the task has been for `DONE_SECONDS` of plans."""
+        done = self._network.end_of(batch, self._key_pose) >= 1
+        self._done_plans = self._done_plans + 1 if done else 0
+        self.done = self._done_plans * self.execution_horizon >= DONE_SECONDS * self.control_hz
 
     def embed(self, history: Sequence[Observation], /) -> None:
         """Embed observations before `plan` needs them: most of the work."""

@@ -20,6 +20,7 @@ from touchgoal.policies.actions import (
 )
 from touchgoal.policies.config import ActionRepresentation, TouchInput
 from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig, Regression
+from touchgoal.policies.heads.end import EndOutput
 from touchgoal.policies.heads.mlp import MLPConfig, readout
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
@@ -54,6 +55,7 @@ class PolicyConfig:
     touch_input: TouchInput = "wrench"
     touch_projection_dim: int = 64  # width of the projection, with "embedding"
     watches_novelty: bool = False  # whether it detects touch that is unlike the training's
+    says_end: bool = False  # whether it says when the task is done
     # standard deviation of noise on normalised embeddings in training. Without it the network
     # recognises each recorded episode by its sensors
     touch_noise: float = 0.1
@@ -167,6 +169,7 @@ class PolicyNetwork(nn.Module):
         self.novelty = NoveltyDetector(config.touch_dim) if watches else None
         condition_dim += kp.KEY_POSE_DIM if self.key_pose else 0
         self.condition_dim = condition_dim
+        self.end = EndOutput(condition_dim) if config.says_end else None
         if isinstance(config.head, DiffusionConfig):
             self.head = Diffusion(config.head, ticks, ACTION_DIM, condition_dim)
         else:
@@ -210,6 +213,24 @@ class PolicyNetwork(nn.Module):
     def novelty_of(self, batch: ObservationBatch) -> float:
         """Return the novelty of the first observation's latest touch; above 1 it is unknown."""
         return self.novelty(batch.touch[:1, -1]).item() if self.novelty else 0.0
+
+    @torch.inference_mode()
+    def end_of(self, batch: ObservationBatch, average: KeyPoseAverage | None = None) -> float:
+        """Return whether the task is done as the first observation says: 1 and more; 0 if it never says.
+
+        With cameras it needs the `average` that the plan was made with.
+        """
+        if self.end is None:
+            return 0.0
+        pose = average.latest if average and self.key_pose else None
+        return self.end(self._encode(batch, self._encode_touch(batch), pose))[0].item()
+
+    def condition(
+        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"] | None = None
+    ) -> Float[Tensor, "b c"]:
+        """Return what the head reads, with cameras at true key poses."""
+        pose = None if key_pose is None else self._true_pose(batch, key_pose)
+        return self._encode(batch, self._encode_touch(batch), pose)
 
     def loss(
         self,
@@ -279,7 +300,7 @@ class PolicyNetwork(nn.Module):
         """
         keeps, pose = average is not None and average.gripper_moves, None
         if self.key_pose and key_pose is not None:
-            pose = kp.true_pose(self._hand(batch.state[:, -1])[:, :7], key_pose)
+            pose = self._true_pose(batch, key_pose)
         elif self.key_pose:
             assert average is not None, "needs the episode's average, or the true key poses"
             maps, hand = self.seen(batch)
@@ -295,6 +316,11 @@ class PolicyNetwork(nn.Module):
                 planned = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)
                 actions[..., -1] = width if keeps else planned
         return actions
+
+    def _true_pose(
+        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]
+    ) -> Float[Tensor, "b 11"]:
+        return kp.true_pose(self._hand(batch.state[:, -1])[:, :7], key_pose)
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None

@@ -35,10 +35,9 @@ def toy_dataset(
     actions = 0.01 * torch.randn(n, 8, generator=generator)
     actions[:, 7] = 0.0  # a gripper that stays, as in the bead maze
     wrench = touch.float().sum(1, keepdim=True).repeat(1, WRENCH_DIM)
-    return SequenceDataset(
-        Recordings(touch, state, actions, lengths, wrench=wrench if config.reads_wrench else None),
-        config,
-    )
+    done = torch.cat([torch.arange(length) >= length - 10 for length in lengths])
+    wrench = wrench if config.reads_wrench else None
+    return SequenceDataset(Recordings(touch, state, actions, lengths, done, wrench=wrench), config)
 
 
 def toy_policy(config: PolicyConfig, windows: SequenceDataset, seed: int = 0) -> PolicyNetwork:

@@ -63,7 +63,7 @@ assert not set(BLOCKED) & set(sys.modules)
 assert parse(deploy.Config, ["sim"], prog="deploy", description="", envs=None).cell == Path("sim")
 with tempfile.TemporaryDirectory() as name:
     result, _ = run(Path(name), "expert", 40.0)
-    assert result.ending.reason == "the plan is through", result.ending
+    assert result.ending.reason == "the policy is done", result.ending
     (Path(name) / "own.py").write_text(USER_POLICY)
     result, fake = run(Path(name), f"{name}/own.py:Turns", 1.0)
     assert result.ending.reason.startswith("time is up"), result.ending

@@ -26,7 +26,7 @@ _DELAYED = {  # state and images; at 20 Hz a tick is 50 ms; learned policies go 
 }
 _LONGER = 1.5  # factor on the time limit of an episode with late or frozen observations
 _FROZEN = {"every second picture frozen": {"image_rate": 10.0}}
-_CHANGES: dict[SimulatedTask, dict[str, dict[str, Any]]] = {
+CHANGES: dict[SimulatedTask, dict[str, dict[str, Any]]] = {
     "pick-place": {
         **_LIGHT,
         "1 other object, target named": {"distractors": 1},
@@ -88,5 +88,5 @@ def _environments(config: Config, task: SimulatedTask) -> dict[str, TaskConfig]:
         )
         for name, change in (_DELAYED | _FROZEN).items()
     }
-    changed = {name: replace(base, **change) for name, change in _CHANGES[task].items()}
+    changed = {name: replace(base, **change) for name, change in CHANGES[task].items()}
     return {UNCHANGED: base, **changed, **late}

@@ -85,7 +85,7 @@ class Ending:
 Request = Literal["", "stop", "done", "not done", "discard", "success"]
 """Operator's request: go on, stop the arm, end with the task done or not, or without a record;
 success: a simulator's; failed: the cost's."""
-PLAN_ENDED, TIME_UP = "the plan is through", "time is up"
+PLAN_ENDED, TIME_UP = "the policy is done", "time is up"
 JUDGED = "the judge says that the task is done"
 STOPPED_BY_OPERATOR, DISCARDED = "stopped by the operator", "discarded by the operator"
 _REQUESTED_ENDINGS: dict[Request, Ending] = {

@@ -25,6 +25,7 @@ from touchgoal.sim_envs.tasks import make_env
 
 REFUSED = "refused"  # failure of an episode in which the policy would not act
 GAVE_UP = "gave up"  # of one in which it closed on nothing again and again
+FALSELY_DONE = "falsely done"  # of one that it ended as done
 _TOLERANCE = 1e-3  # rad or m by which an action may exceed a limit before it counts as clamped
 _LIGHT_TICKS = 10  # from one look at the fingertips' light to the next
 
@@ -37,7 +38,7 @@ class Trial:
         seed: random seed of the episode.
         success: as the task defines it.
         progress: the greatest reached, in [0, 1].
-        failure: what ended it, such as drop, over_force, time or refused; "" after a success.
+        failure: what ended it, such as drop, over_force, time, refused or falsely done; "" after a success.
         peak_force: greatest external force on the hand, N.
         mean_force: its mean, N.
         peak_pad_force: greatest normal force on a fingertip, N.
@@ -170,7 +171,7 @@ def run_trial(
                 rows.append([last[key] for key in keys])  # images would fill the memory
                 if judging and judging.ended(last):
                     break
-            failed = [GAVE_UP] if actor.given_up else []
+            failed = [GAVE_UP] * bool(actor.given_up) + [FALSELY_DONE] * actor.done
         except RefusedError:
             rows, failed = [*rows, [last[key] for key in keys]], [REFUSED]
         wrench, pads, progress, actions = (np.stack(column) for column in zip(*rows, strict=True))

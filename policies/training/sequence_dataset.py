@@ -10,8 +10,10 @@ from torch import Tensor
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.batch_noise import BatchNoise
+from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
+from touchgoal.policies.heads.end import END_SECONDS
 from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
@@ -33,6 +35,7 @@ class Recordings:
     state: Float32[Tensor, "n s"]  # proprioception
     actions: Float32[Tensor, "n 8"]  # `features.ACTION`
     lengths: tuple[int, ...]  # ticks of each episode
+    done: Bool[Tensor, " n"]  # whether the task is done: the end of a successful episode
     images: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
     wrench: Float32[Tensor, "n 12"] | None = None  # on both pads (N, Nm, pad frames), if trained on
     maps: Float16[Tensor, "n k c y x"] | None = None  # camera feature maps, see `ImageEmbedder`
@@ -88,11 +91,24 @@ def load_recordings(
     return Recordings(
         *parts,
         lengths=lengths,
+        done=_done(episodes, chosen, lengths, config.control_hz),
         images=torch.from_numpy(np.concatenate(differences)) if config.end_to_end else None,
         wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
         maps=torch.from_numpy(np.concatenate(maps)) if images else None,
         key_pose=key_pose,
     )
+
+
+def _done(
+    episodes: EpisodeSet, chosen: Sequence[int], lengths: Sequence[int], hz: int
+) -> Bool[Tensor, " n"]:
+    """Return the last `END_SECONDS` of each episode but those corrected ones that failed."""
+    parts, ticks = [], round(END_SECONDS * hz)
+    for i, length in zip(chosen, lengths, strict=True):
+        meta = episodes.meta(i)
+        failed = meta.get("outcome") == CORRECTED and not meta.get("success")
+        parts.append((torch.arange(length) >= length - ticks) & (not failed))
+    return torch.cat(parts)
 
 
 def _check(

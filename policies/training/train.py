@@ -19,6 +19,7 @@ from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, 
 from touchgoal.policies import checkpoint
 from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
+from touchgoal.policies.training.end import fit_end
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
@@ -63,6 +64,8 @@ def train(
         if folders and averaged.key_pose:
             batch = _validation_batch(averaged, validation)
             averaged.key_pose.calibrate(*averaged.seen(_observed(batch)), batch["key_pose"][:, 1:])
+        if folders and averaged.end:  # how many validation episodes it ends, of how many
+            known["ended"] = fit_end(averaged, windows, validation, options.seed)
         for folder in folders:
             on_first_process(partial(checkpoint.save, averaged, folder, provenance | known))
 
@@ -183,7 +186,7 @@ def _checksum(windows: SequenceDataset) -> str:
     recorded = windows.recorded
     return checksum(
         recorded.touch, recorded.state, recorded.actions, recorded.images, recorded.wrench,
-        recorded.maps, recorded.key_pose, map(str, recorded.lengths), windows.weights,
+        recorded.maps, recorded.key_pose, recorded.done, map(str, recorded.lengths), windows.weights,
     )  # fmt: skip
 
 

@@ -1,0 +1,33 @@
+"""Whether the task is done, read out of what a policy's head reads."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from touchgoal.policies.heads.mlp import readout
+
+END_SECONDS = 0.5  # s at the end of a successful recording in which the task is done
+DONE_SECONDS = 0.3  # s for which a policy must find it done
+_WIDTH = 64
+
+
+class EndOutput(nn.Module):
+    """Probability that the task is done, as a share of the limit above which it counts as done.
+
+    It is fitted to a trained policy (`training/end.py`), which it leaves as it is. Until then, and where
+    the end looks like what comes before, the limit is infinite: nothing is done.
+    """
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.mean, self.scale = nn.Buffer(torch.zeros(inputs)), nn.Buffer(torch.ones(inputs))
+        self.limit = nn.Buffer(torch.tensor(torch.inf))
+        self.network = readout(inputs, _WIDTH, 1).requires_grad_(False)
+
+    def scaled(self, condition: Float[Tensor, "b c"]) -> Float[Tensor, "b c"]:
+        """Return what the network reads: of variance 1, without extremes."""
+        return ((condition - self.mean) / self.scale).clamp(-5, 5)
+
+    def forward(self, condition: Float[Tensor, "b c"]) -> Float[Tensor, " b"]:
+        """Return the share of the limit; 1 and more: done."""
+        return self.network(self.scaled(condition))[:, 0].sigmoid() / self.limit
