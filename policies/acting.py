@@ -198,7 +198,7 @@ class LearnedPolicy(Planner):
 
     def _notice_end(self, batch: ObservationBatch) -> None:
         """Be done once the task has been for `DONE_SECONDS` of plans."""
-        done = self._network.end_of(batch, self._key_pose) >= 1
+        done = self._network.end_of(batch, self._key_pose) > 1
         self._done_plans = self._done_plans + 1 if done else 0
         self.done = self._done_plans * self.execution_horizon >= DONE_SECONDS * self.control_hz
 

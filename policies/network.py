@@ -216,7 +216,7 @@ class PolicyNetwork(nn.Module):
 
     @torch.inference_mode()
     def end_of(self, batch: ObservationBatch, average: KeyPoseAverage | None = None) -> float:
-        """Return whether the task is done as the first observation says: 1 and more; 0 if it never says.
+        """Return whether the first observation says that the task is done: above 1; 0 if it never says.
 
         With cameras it needs the `average` that the plan was made with.
         """

@@ -55,8 +55,8 @@ def test_a_policy_is_done_once_it_has_looked_so_for_a_while() -> None:
 
     actor.reset()
     assert not any(ends_after(0.0, 20))
-    assert not any(ends_after(LIFTED, 2)) and not any(ends_after(0.0, 6))  # 0.1 s are too short
-    assert ends_after(LIFTED, 12)[-4:] == [True] * 4
+    assert not any(ends_after(LIFTED, 12)) and not any(ends_after(0.0, 6))  # 0.6 s are too short
+    assert ends_after(LIFTED, 24)[-4:] == [True] * 4
     actor.reset()
     assert not actor.done
 
