@@ -9,7 +9,7 @@ CODE := runtime control sim_envs episodes encoders rewards policies benchmarks l
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test interop interop-lerobot lint check format build docs images typings weights weights-markers maze-policy maze-wrench-policy pick-place-policy fragile-carry-policy pose-estimator fragile-carry clean
+.PHONY: setup demo test interop interop-lerobot lint check format build docs images typings weights weights-markers weights-markers-mae maze-policy pick-place-policy fragile-carry-policy pose-estimator fragile-carry clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -151,8 +151,8 @@ define record
 endef
 # Arguments: folder, command and options.
 define train
-	test -e $(RUN)/$(1)/metrics.json || { rm -rf $(RUN)/$(1); $(BIN)/touchgoal $(2) \
-		--data $(RUN)/train/episodes --validation $(RUN)/val/episodes --out $(RUN)/$(1); }
+	test -e $(RUN)/$(1)/done || { rm -rf $(RUN)/$(1); $(BIN)/touchgoal $(2) --data $(RUN)/train/episodes \
+		--validation $(RUN)/val/episodes --out $(RUN)/$(1) && touch $(RUN)/$(1)/done; }
 
 endef
 # Arguments: round, episodes, first seed, environment.
@@ -186,38 +186,27 @@ pick-place-policy: $(READY)
 # this perceptron 37 and, from another seed, 39. With longer training, the errors on validation wires rise.
 MAZE := --task bead-maze --env.n-wires 260 --env.start-angle 10 $(DEPLOYED)
 MAZE_VALIDATION := --task bead-maze --env.split validation --env.n-wires 16 --env.start-angle 10 $(DEPLOYED)
-MAZE_LEARN := train-policy --task bead-maze --arm-state commanded --env.start-angle 10 --train.snapshot-epochs 5 \
-	--refuse-unknown-touch
-MAZE_ROUND := --head regression --train.epochs 5
-define maze_rounds
-$(call correct,1,80,300000,$(MAZE))
-$(call correct,2,80,400000,$(MAZE))
-$(call correct,3,80,500000,$(MAZE))
-endef
 maze-policy: RUN := runs/maze
-maze-policy: LEARN := $(MAZE_LEARN) --encoder gelsight_mini_markers_mae
-maze-policy: ROUND := $(MAZE_ROUND)
+maze-policy: LEARN := train-policy --task bead-maze --arm-state commanded --env.start-angle 10 \
+	--train.snapshot-epochs 5 --refuse-unknown-touch $(TOUCH)
+maze-policy: ROUND := --head regression --train.epochs 5
 maze-policy: $(READY)
 	$(call record,val,12,100000,$(MAZE_VALIDATION))
 	$(call record,train,160,0,$(MAZE))
-	$(maze_rounds)
+	$(call correct,1,80,300000,$(MAZE))
+	$(call correct,2,80,400000,$(MAZE))
+	$(call correct,3,80,500000,$(MAZE))
 	$(call train,policy,$(LEARN) --touch-noise 0.5 --train.epochs 3 --action-share 0.98 $(BEST))
 	rm -rf policies/weights/bead_maze && cp -r $(RUN)/policy/policy policies/weights/bead_maze
 	rm -r policies/weights/bead_maze/touch
 
-# The baseline: a regression on wrenches that a small network, trained on the simulator's truth, reads from touch.
-maze-wrench-policy: RUN := runs/maze_wrench
-maze-wrench-policy: LEARN := $(MAZE_LEARN) --encoder runs/maze_wrench/touch/encoder --touch-input wrench
-maze-wrench-policy: ROUND := $(MAZE_ROUND)
-maze-wrench-policy: $(READY)
+# The encoder of the Mini with markers that policies read, without labels, on the maze's demonstrations.
+weights-markers-mae: RUN := runs/maze
+weights-markers-mae: $(READY)
 	$(call record,val,12,100000,$(MAZE_VALIDATION))
 	$(call record,train,160,0,$(MAZE))
 	$(call train,touch,train-encoder mae --frames 45 --mae.bottleneck --mae.epochs 12)
-	$(maze_rounds)
-	$(call train,policy,$(LEARN) $(ROUND) $(BEST))
-	rm -rf policies/weights/bead_maze_wrench && cp -r $(RUN)/policy/policy policies/weights/bead_maze_wrench
-	mv policies/weights/bead_maze_wrench/touch/* encoders/weights/gelsight_mini_markers_mae/
-	rmdir policies/weights/bead_maze_wrench/touch
+	cp $(RUN)/touch/encoder/* encoders/weights/gelsight_mini_markers_mae/
 
 # The rod's slip and weight are felt: no cameras. 20 minutes on 2 cores.
 fragile-carry-policy: RUN := runs/fragile_carry

@@ -48,12 +48,11 @@ def mended(metrics: Metrics) -> str:
 
 
 def ended(metrics: Metrics) -> str:
-    """Share of each row's runs that end done, by the policy's word, and of those falsely called so."""
+    """Success of every row, and how many failures the policy called done."""
     rows = []
     for row in metrics["rows"]:
-        said = [end["success"] for end in row["ends"] if end["said"]]
-        rate = SuccessRate(sum(said), len(row["ends"]))
-        rows.append(f"{row['what']} {rate}, falsely {len(said) - sum(said)}")
+        falsely = sum(trial["failure"] == "falsely done" for trial in row["trials"])
+        rows.append(f"{row['what']} {_rate(row['trials'])}, falsely {falsely}")
     return "; ".join(rows)
 
 

@@ -7,15 +7,13 @@ import numpy as np
 from touchgoal.control import features as ft
 
 
-def parts_of(
-    tick: Mapping[str, np.ndarray], name: str
-) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Return images "name/IMAGE" and scalars "name/PLOT/CURVE" of an observation.
+def parts_of(tick: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Return images "IMAGE" and scalars "PLOT/CURVE" of an observation.
 
     Cost, progress and action are among the scalars where the tick has them.
     """
     images = {
-        f"{name}/{key.removeprefix(ft.IMAGE_PREFIX)}": value
+        key.removeprefix(ft.IMAGE_PREFIX): value
         for key, value in tick.items()
         if key.startswith(ft.IMAGE_PREFIX)
     }
@@ -29,4 +27,4 @@ def parts_of(
         *changes, width = tick[ft.ACTION]
         curves["gripper width (mm)/commanded"] = 1e3 * width
         curves |= {f"joint change (rad)/joint_{i}": c for i, c in enumerate(changes, 1)}
-    return images, {f"{name}/{path}": float(value) for path, value in curves.items()}
+    return images, {path: float(value) for path, value in curves.items()}

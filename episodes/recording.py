@@ -30,7 +30,7 @@ from touchgoal.sim_envs.scene.filming import SceneRecorder
 from touchgoal.sim_envs.scene.objects import CATALOGUE, of_same_shape
 from touchgoal.sim_envs.tasks import make_env, make_expert
 
-_OUTCOME_SECONDS = 1.0  # s of rest after an actor is done, in which the simulator sees the outcome
+OUTCOME_SECONDS = 1.0  # s of rest after an actor is done, in which the simulator sees the outcome
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,6 @@ class EpisodeSpec:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-OnTick = Callable[[dict[str, np.ndarray], UInt8[np.ndarray, "h w 3"]], None]
-"""Takes each tick that `run` yields, and the film's newest image."""
 CORRECTED = "corrected"
 """Outcome of an episode in which a policy acted while an expert's actions were recorded."""
 Roles = Callable[[Any, EpisodeSpec], tuple[Actor, Actor]]
@@ -130,7 +128,7 @@ def run(
         if terminated or truncated or actor.given_up:
             break
         if actor.done and expert is None:
-            rest = max(rest, _OUTCOME_SECONDS)
+            rest = max(rest, OUTCOME_SECONDS)
             break
     still = np.append(np.zeros(env.n_joints), recorded[-1]).astype(np.float32)
     yield {**observation, ft.ACTION: still, **info}
@@ -157,7 +155,6 @@ def record_with_film(
     spec: EpisodeSpec,
     policy: Callable[[Any], Actor] | None = None,
     meshes: Literal["fast", "full"] = "full",
-    on_tick: OnTick | None = None,
 ) -> tuple[Episode, UInt8[np.ndarray, "n h w 3"]]:
     """Record and film an episode, tick by tick; the images are for `episodes.film.write_film`.
 
@@ -170,9 +167,7 @@ def record_with_film(
     at_most = round(env.config.max_seconds * env.config.control_hz)
     for tick in track(run(env, actor, observation, info), "filming", "frame", total=at_most):
         ticks.append(tick)
-        image = film.capture()
-        if on_tick is not None:
-            on_tick(tick, image)
+        film.capture()
     film.close()
     return to_episode(env, ticks, spec), film.images
 

@@ -5,15 +5,13 @@ images. Leave the gel untouched for the first second, then press any object, pre
 (--ball-mm), or lay a weight on the gel (--weight-g).
 """
 
-from collections.abc import Callable
-from itertools import chain, count, islice
+from itertools import chain, islice
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
 from touchgoal.runtime.option_types import Corners, Positive, checked_dataclass
-from touchgoal.runtime.viewer.stream import RerunStream, open_rerun
 
 
 @checked_dataclass
@@ -37,9 +35,6 @@ class Config:
     """Exposure to lock, in the camera's units; default: as it is set."""
     seconds: Positive = 20.0
     """For how long a live sensor is watched, s; Ctrl-C ends earlier."""
-    rerun: str | None = None
-    """Also show each frame, its contact strength and contact in the rerun viewer (extra viz): live, or
-    an .rrd file to write."""
     out: Path | None = None
     """Folder of the run."""
 
@@ -66,27 +61,9 @@ def main(config: Config) -> None:
     if config.background is not None:
         untouched = fingertip_source.recorded_frames(config.background, sensor, config.corners)
         frames = chain(islice(untouched, SETTLES_WITHIN), frames)
-    if config.rerun is None:
-        check = check_sensor(frames, sensor, ball)
-    else:
-        with open_rerun(config.rerun) as stream:
-            check = check_sensor(frames, sensor, ball, _shown_in(stream))
+    check = check_sensor(frames, sensor, ball)
     figures = check_report.figures(check, config.ball_mm, config.weight_g)
     print("\n".join(check_report.lines(check, figures)))
     write_json(out / "metrics.json", figures)
     write_image(out / "check.png", check_report.image(check))
     print(f"presses, their change and depth: {out / 'check.png'}")
-
-
-def _shown_in(stream: RerunStream) -> Callable[[Any, float, bool], None]:
-    """Return what logs a frame; frames have no time, they are counted from 1."""
-    frames = count(1)
-
-    def show(frame: Any, strength: float, touching: bool) -> None:
-        scalars = {
-            "sensor/strength (counts)/strength": strength,
-            "sensor/contact/contact": touching,
-        }
-        stream.log(next(frames), None, {"sensor/fingertip": frame}, scalars)
-
-    return show

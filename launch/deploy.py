@@ -9,7 +9,6 @@ stopped, by a fault or the operator.
 
 import sys
 from collections.abc import Callable
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +18,7 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.interfaces import Planner
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
-from touchgoal.runtime.viewer.stream import BackgroundStream
+from touchgoal.runtime.viewer.stream import RerunStream
 
 if TYPE_CHECKING:
     from touchgoal.control.cell.connection import CellConnection
@@ -76,7 +75,7 @@ def main(config: Config) -> None:
     check_client(cell)
     out = open_run(config.out, "deploy", config, adds=True)
     print(_summary(cell, config), flush=True)
-    stream = BackgroundStream(config.rerun) if config.rerun is not None else None
+    stream = RerunStream(config.rerun) if config.rerun is not None else None
     try:
         connection = connect(cell)
         try:
@@ -141,7 +140,7 @@ def _deploy(
     cost: Any,
     connection: "CellConnection",
     episodes: Path,
-    stream: BackgroundStream | None,
+    stream: RerunStream | None,
 ) -> "Result":
     from touchgoal.control.deployment.actors import make_actor
     from touchgoal.control.deployment.session import Session
@@ -178,26 +177,24 @@ def _deploy(
         return session.run()
 
 
-def _shown_in(stream: BackgroundStream, dt: float) -> "Callable[[TickStatus], None]":
+def _shown_in(stream: RerunStream, dt: float) -> "Callable[[TickStatus], None]":
     """Return what logs a tick of `dt` (s), its command as an episode's action."""
     import numpy as np
 
     from touchgoal.control import features as ft
     from touchgoal.control.tick_parts import parts_of
 
-    frames = count()
-
     def show(status: "TickStatus") -> None:
         tick = {**status.reading.observation}
         tick[ft.ACTION] = np.append(status.state.velocity * dt, status.width)
         if status.cost is not None:
             tick[ft.COST] = np.array([status.cost.cost])
-        images, scalars = parts_of(tick, "arm")
+        images, scalars = parts_of(tick)
         for key, depth in zip(ft.TACTILE, status.reading.indentation, strict=True):
             if key in tick:
                 curve = key.removeprefix(ft.IMAGE_PREFIX)
-                scalars[f"arm/indentation (mm)/{curve}"] = 1e3 * depth
-        stream.log(next(frames), status.seconds, images, scalars)
+                scalars[f"indentation (mm)/{curve}"] = 1e3 * depth
+        stream.log(status.seconds, images, scalars)
 
     return show
 

@@ -41,23 +41,18 @@ class Config:
     and judges them beside the simulator, after a second of rest."""
     video: bool = True
     """Film the worst, the median and the best episode."""
-    rerun: str | None = None
-    """Show these three in the rerun viewer (extra viz): live, or an .rrd file to write."""
     env: TaskConfig = ENVS["pick-place"]
     """Options of the task. Only images that the policy reads are rendered."""
 
 
 def main(config: Config) -> None:
-    """Run the episodes, print the table, film or show three of them."""
+    """Run the episodes, print the table, film three of them."""
     from touchgoal.policies.by_name import prepare_policy
     from touchgoal.policies.checkpoint import EPISODE_OBJECT
     from touchgoal.policies.evaluation.evaluate import run_trials, trial_specs
     from touchgoal.policies.evaluation.report import film_trials, record_trials
     from touchgoal.runtime.run_folder import open_run
-    from touchgoal.runtime.viewer.stream import load_rerun
 
-    if config.rerun is not None:
-        load_rerun(config.rerun)  # before the episodes are run
     policy, env = prepare_policy(config.policy, config.env, config.target)
     judge = None
     if config.judge is not None:
@@ -69,9 +64,8 @@ def main(config: Config) -> None:
     out = open_run(config.out, "run-policy", replace(config, env=env))
     trials = run_trials(env, policy, specs, config.ray or config.workers, judge)
     trials = record_trials(out, trials, len(specs))
-    if config.video or config.rerun is not None:
-        films = out if config.video else None
-        film_trials(films, env, specs, trials, policy, config.workers, config.rerun)
+    if config.video:
+        film_trials(out, env, specs, trials, policy, config.workers)
     if config.task not in get_args(SimulatedTask):
         return
     cell = "sim" if config.task == "pick-place" else "sim_maze"

@@ -12,7 +12,6 @@ from touchgoal.policies.config import (
     ArmState,
     Head,
     SamplerConfig,
-    TouchInput,
     TrainConfig,
 )
 from touchgoal.policies.training.action_meaning import ActionMeaning, check_actions
@@ -133,9 +132,6 @@ class Config(TrainingOptions):
     arm_state: ArmState | None = None
     """Arm state that the policy reads: measured, or commanded, which no delay affects. Default: commanded
     if the episodes have it, as observation.command."""
-    touch_input: TouchInput = "embedding"
-    """Input from a frozen touch encoder: embedding (a projection trained on the actions alone), or
-    wrench (a small network trained on the simulator's pad forces and torques)."""
     refuse_unknown_touch: bool = False
     """The policy stops once touch has been unlike all of the training for a second. For episodes in
     which an expert corrected a policy (make-policy): a limit from demonstrations alone also stops
@@ -264,7 +260,6 @@ def _policy_config(
     return PolicyConfig(
         touch_dim=touch.dim if touch else 0,
         touch=touch.name if touch else "",
-        touch_input=config.touch_input,
         touch_projection_dim=_PROJECTION_DIM[config.preset],
         watches_novelty=config.refuse_unknown_touch,
         says_end=True,

@@ -27,8 +27,6 @@ SHIPPED_POLICIES = {
     "fragile-carry": _WEIGHTS / "fragile_carry",
 }
 """The shipped policies: each is named after its task."""
-FURTHER_POLICIES = {"bead-maze-wrench": _WEIGHTS / "bead_maze_wrench"}
-"""Further shipped policies: the maze's baseline, a regression on wrenches read from the embedding."""
 POLICY_FORMAT = WeightsFormat("policy", "policy", "train one with: touchgoal train-policy")
 
 
@@ -139,8 +137,8 @@ def load_policy(name_or_path: str | Path, target: str | None = None) -> LearnedP
     """Load a policy to act with.
 
     Args:
-        name_or_path: name of a shipped policy ("pick-place", "bead-maze", "bead-maze-wrench"),
-            or a folder that train-policy made.
+        name_or_path: name of a shipped policy, such as "bead-maze", or a folder that train-policy
+            made.
         target: the object to pick up where several lie on the table, in words.
 
     Raises:
@@ -155,7 +153,7 @@ def find_policy(name_or_path: str | Path, task: str = "") -> Path:
     A command names its `task`: then "shipped" is that task's, and the message lists what else
     `--policy` takes.
     """
-    name, folders = str(name_or_path), SHIPPED_POLICIES | FURTHER_POLICIES
+    name, folders = str(name_or_path), SHIPPED_POLICIES
     if name == "shipped" and task:
         if task not in SHIPPED_POLICIES:
             raise UserError(f"no policy ships for {task}: train one, or take the expert")

@@ -12,7 +12,6 @@ from touchgoal.sim_envs.config import USUAL_CAMERA, CameraPlacement
 Head = Literal["mlp", "regression", "published", "tiny"]
 """A diffusion head with a multilayer perceptron or a U-Net of that size, or one that predicts a plan directly."""
 ArmState = Literal["measured", "commanded"]
-TouchInput = Literal["wrench", "embedding"]
 ActionRepresentation = Literal["delta", "relative", "absolute", "base_twist", "body_twist"]
 """Representation of a plan; see `train_policy.Config`. "relative" is UMI's word (Chi et al. 2024).
 The hand's displacement and rotation (m, rad) are to first order. "base_twist" adds the third
@@ -26,7 +25,6 @@ POLICIES = {
     "pick-place": "the learned policy that ships for pick-place",
     "bead-maze": "the learned policy that ships for bead-maze",
     "fragile-carry": "the learned policy that ships for fragile-carry; in simulation alone",
-    "bead-maze-wrench": "bead-maze: the baseline, a regression on wrenches read from touch",
 }
 """Names of policies, and what they are."""
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float16, UInt8
 from torch import Tensor, nn
 
@@ -18,10 +17,10 @@ from touchgoal.policies.actions import (
     to_actions,
     to_representation,
 )
-from touchgoal.policies.config import ActionRepresentation, TouchInput
+from touchgoal.policies.config import ActionRepresentation
 from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig, Regression
 from touchgoal.policies.heads.end import EndOutput
-from touchgoal.policies.heads.mlp import MLPConfig, readout
+from touchgoal.policies.heads.mlp import MLPConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
 from touchgoal.policies.perception.novelty import NoveltyDetector
@@ -37,7 +36,6 @@ from touchgoal.policies.sight.frozen_images import ImageInputConfig
 from touchgoal.policies.sight.readout import KeyPoseReadout
 from touchgoal.runtime.errors import UserError
 
-WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
 _DRAWS = 8  # noise draws per window with cameras: the camera network costs most of a training step
 NOVEL_SECONDS = 1.0  # s for which novelty must last to count
 _CLIP = 5.0  # standard deviations
@@ -49,11 +47,7 @@ class PolicyConfig:
 
     touch_dim: int  # of the frozen embedding of both fingertips together; 0 without touch
     touch: str  # names what made the embeddings: encoder, sensor, background
-    # "wrench": a small network, trained only on the simulator's pad forces (TacBench's T1), reads
-    # the wrenches on both pads from the embedding; the head gets those 12 numbers. "embedding": a
-    # projection that is trained on the actions alone, for episodes without that truth
-    touch_input: TouchInput = "wrench"
-    touch_projection_dim: int = 64  # width of the projection, with "embedding"
+    touch_projection_dim: int = 64  # to which a projection, trained on the actions, narrows it
     watches_novelty: bool = False  # whether it detects touch that is unlike the training's
     says_end: bool = False  # whether it says when the task is done
     # standard deviation of noise on normalised embeddings in training. Without it the network
@@ -107,11 +101,6 @@ class PolicyConfig:
                 )
 
     @property
-    def reads_wrench(self) -> bool:
-        """Whether training needs `truth.pad_wrench`."""
-        return self.touch_dim > 0 and self.touch_input == "wrench"
-
-    @property
     def estimated(self) -> tuple[str, ...]:
         """Columns that a state estimator supplies on an arm."""
         return tuple(key for key in self.proprioception if not key.startswith("observation."))
@@ -148,17 +137,11 @@ class PolicyNetwork(nn.Module):
         self.config = config
         ticks = config.prediction_horizon
         self.touch_normalizer = Normalizer((config.touch_dim,))
-        self.wrench_normalizer = Normalizer((WRENCH_DIM,))
         self.state_normalizer = Normalizer((config.proprioception_dim,))
         self.action_normalizer = Normalizer((ticks, ACTION_DIM))
         # narrowed before the U-Net, whose FiLM would multiply the embedding's width
-        self.touch_readout, width = None, 0
-        if config.reads_wrench:
-            width = WRENCH_DIM
-            self.touch_readout = readout(config.touch_dim, 256, width)
-        elif config.touch_dim:
-            width = config.touch_projection_dim
-            self.touch_readout = nn.Linear(config.touch_dim, width)
+        width = config.touch_projection_dim if config.touch_dim else 0
+        self.touch_readout = nn.Linear(config.touch_dim, width) if width else None
         condition_dim = config.observation_horizon * (width + config.proprioception_dim)
         self.end_to_end_encoder = None
         if config.end_to_end:
@@ -181,7 +164,6 @@ class PolicyNetwork(nn.Module):
         state: Float[Tensor, "n s"],
         joints: Float[Tensor, "m 7"],
         actions: Float[Tensor, "m h 8"],
-        wrench: Float[Tensor, "n 12"] | None = None,
         action_is_pad: Bool[Tensor, "m h"] | None = None,
         maps: Float16[Tensor, "n k c y x"] | None = None,
         key_pose: Float[Tensor, "n 3 8"] | None = None,
@@ -193,8 +175,6 @@ class PolicyNetwork(nn.Module):
         """
         if self.config.touch_dim:
             self.touch_normalizer.fit_mean_std(touch)
-        if wrench is not None:
-            self.wrench_normalizer.fit_mean_std(wrench)
         if self.key_pose:
             assert maps is not None and key_pose is not None, "needs maps and key poses"
             self.key_pose.fit(maps, self._hand(state), key_pose[:, 1:])
@@ -237,13 +217,12 @@ class PolicyNetwork(nn.Module):
         batch: ObservationBatch,
         actions: Float[Tensor, "b h 8"],
         noise: BatchNoise,
-        wrench: Float[Tensor, "b o 12"] | None = None,
         action_is_pad: Bool[Tensor, "b h"] | None = None,
         key_pose: Float[Tensor, "b 3 8"] | None = None,
     ) -> Float[Tensor, ""]:
         """Return the training loss on windows, without ticks after the episode's end.
 
-        With `reads_wrench` it needs the wrenches on both pads, with cameras the next key poses.
+        With cameras it needs the next key poses.
         """
         pose, key_pose_loss = None, torch.zeros((), device=actions.device)
         if self.key_pose:
@@ -252,23 +231,17 @@ class PolicyNetwork(nn.Module):
             key_pose_loss = self.key_pose.loss(maps, hand, key_pose[:, 1:])
             pose = kp.true_pose(hand[:, :7], key_pose)
             draws = 1 if self.end_to_end_encoder else _DRAWS
-            rows = batch.touch, batch.state, batch.images, pose, actions, wrench, action_is_pad
+            rows = batch.touch, batch.state, batch.images, pose, actions, action_is_pad
             again: list[Any] = [None if x is None else x.repeat_interleave(draws, 0) for x in rows]
-            touch, state, images, pose, actions, wrench, action_is_pad = again
+            touch, state, images, pose, actions, action_is_pad = again
             batch = ObservationBatch(touch, state, images)
         chunk = to_representation(actions, batch.joints, self.config.representation)
         if pose is not None and self.config.representation == "body_twist":
             pose, chunk = kp.face_any_way(pose, chunk, noise)
             pose, chunk = kp.set_beside(pose, chunk, noise)
-        touch = self._encode_touch(batch, noise)
-        wrench_loss = torch.zeros((), device=touch.device)
-        if self.config.reads_wrench:
-            assert wrench is not None, "needs the wrenches on the pads"
-            wrench_loss = F.mse_loss(touch, self.wrench_normalizer(wrench))
-            touch = touch.detach()
-        encoded = self._encode(batch, touch, pose, noise)
+        encoded = self._encode(batch, self._encode_touch(batch, noise), pose, noise)
         loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
-        return loss + wrench_loss + key_pose_loss
+        return loss + key_pose_loss
 
     def seen(
         self, batch: ObservationBatch

@@ -124,7 +124,7 @@ def test_learning_the_bead_maze(here: Path, capsys: pytest.CaptureFixture) -> No
         "--mae.batch-size", 8, "--out", "mae")  # fmt: skip
     learn = ("train-policy", *both, *one, "--head", "tiny", "--train.epochs", 2, "--trials", 1,
              "--train.snapshot-epochs", 1, "--env.max-seconds", 1)  # fmt: skip
-    run(*learn, "--encoder", "mae/encoder", "--touch-input", "wrench", "--out", "policy")
+    run(*learn, "--encoder", "mae/encoder", "--out", "policy")
     tried = json.loads(Path("policy/metrics.json").read_text())["snapshots"]
     assert set(tried) == {"epoch-0001", "epoch-0002"}
     capsys.readouterr()
@@ -141,13 +141,15 @@ def test_learning_the_bead_maze(here: Path, capsys: pytest.CaptureFixture) -> No
         "--changes", "light +10%", "2 ticks late", "--episodes", 1, "--workers", 1)  # fmt: skip
     printed = capsys.readouterr().out
     assert "pick-place, light +10%" in printed and "pick-place, 2 ticks late" in printed
+    run_benchmark("policy-ends", "--policy", "expert", "--tasks", "fragile-carry", "--episodes", 1, "--workers", 1)
+    assert "falsely done 0, not said 1" in capsys.readouterr().out
     run_benchmark("policy-latency", "--policy", "policy/policy", "--repeats", 3,
         "--large-repeats", 0)  # fmt: skip
     assert "denoising" in capsys.readouterr().out
     run("train-policy", "--preset", "paper", *both, *one, "--head", "tiny", "--sampler.num-inference-steps", 2, "--trials", 0,
         "--encoder", "mae/encoder", "--train.epochs", 1, "--out", "paper")  # fmt: skip
     paper = checkpoint.load(Path("paper/policy")).config
-    assert paper.representation == "delta" and paper.touch_input == "embedding"
+    assert paper.representation == "delta"
     assert Path("paper/policy/touch/encoder.json").is_file()
     run("train-policy", *both, *one, "--head", "tiny", "--trials", 0, "--encoder", "end-to-end",
         "--train.epochs", 1, "--observation-horizon", 3, "--sampler.loss", "squared", "--out", "jointly")  # fmt: skip

@@ -96,7 +96,7 @@ def test_a_simulated_arm_does_the_job(tmp_path: Path, capsys: pytest.CaptureFixt
     meta = episodes.meta(0)
     if shown:
         rows = rerun_rows(tmp_path / "a.rrd")
-        assert rows["/arm/front"] == rows["/arm/force (N)/force"] == episodes.lengths[0]
+        assert rows["/front"] == rows["/force (N)/force"] == episodes.lengths[0]
         plots = {"force (N)", "gripper width (mm)", "joint change (rad)"}
         assert rerun_views(tmp_path / "a.rrd") == {"front"} | plots
     assert metrics["success"] and meta["arm"] == "sim" and meta["success"] is True

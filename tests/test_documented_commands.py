@@ -69,8 +69,8 @@ def test_command_is_understood(command: Command, capsys: pytest.CaptureFixture, 
         assert not command.whole and "required" in complaint.lower(), complaint
 
 
-POLICIES = "maze-policy maze-wrench-policy pick-place-policy fragile-carry-policy".split()
-TARGETS = ["demo", "images", "weights", "weights-markers", "fragile-carry", *POLICIES]
+POLICIES = "maze-policy pick-place-policy fragile-carry-policy".split()
+TARGETS = "demo images weights weights-markers weights-markers-mae fragile-carry".split() + POLICIES
 ASIDE = ("data", "validation", "out", "resume", "workers", "trials", "env")  # learn nothing
 
 

@@ -71,13 +71,13 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     assert dataset.action_is_pad[0].tolist() == [False] * 2 + [True] * 6
     assert dataset.action_is_pad[2].all() and not dataset.action_is_pad[3:12].any()
     rows = torch.tensor([0, 3])
-    (batch, actions), wrench = dataset.take(rows), dataset.wrench(rows)
+    batch, actions = dataset.take(rows)
     is_pad = dataset.action_is_pad[rows]
     other = torch.where(is_pad[..., None], torch.full_like(actions, 9.0), actions)
     policy = toy_policy(config, dataset)
     losses = []
     for chunk in (actions, other):
-        loss = policy.loss(batch, chunk, BatchNoise(torch_rng()), wrench, is_pad)
+        loss = policy.loss(batch, chunk, BatchNoise(torch_rng()), is_pad)
         losses.append(torch.autograd.grad(loss, list(policy.head.parameters())))
     if isinstance(head, MLPConfig):  # a U-Net sees the padding, noised, beside the rest
         for one, two in zip(*losses, strict=True):
@@ -98,7 +98,7 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
         TOY,
         replace(TOY, head=FLOW, representation="absolute"),
         replace(TOY, head=DiffusionConfig(MLPConfig(64, 2))),
-        replace(TOY, head=MLPConfig(64, 2), representation="delta", touch_input="embedding"),
+        replace(TOY, head=MLPConfig(64, 2), representation="delta"),
     ],
     ids=["ddim-relative", "flow-absolute", "mlp-relative", "regression-delta"],
 )
@@ -106,10 +106,10 @@ def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
     windows = toy_dataset(config, (6, 6))
     policy = toy_policy(config, windows)
     rows = torch.arange(len(windows))
-    (condition, actions), wrench = windows.take(rows), windows.wrench(rows)
+    condition, actions = windows.take(rows)
     optimiser, generator = torch.optim.Adam(policy.parameters(), 5e-3), torch_rng()
     for _ in range(120):
-        loss = policy.loss(condition, actions, BatchNoise(generator), wrench, windows.action_is_pad)
+        loss = policy.loss(condition, actions, BatchNoise(generator), windows.action_is_pad)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -190,7 +190,7 @@ def record_ticks(root: Path, *episodes: list[dict[str, np.ndarray]]) -> Path:
 
 def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     embedder = toy_touch_embedder()
-    config = replace(TOY, touch_dim=embedder.dim, touch_input="embedding")
+    config = replace(TOY, touch_dim=embedder.dim)
     ticks = toy_observations(4), toy_observations(6)
     episodes = EpisodeSet(record_ticks(tmp_path / "set/episodes", *ticks))
     first = load_recordings(episodes, [0, 1], config, embedder)
@@ -209,15 +209,13 @@ def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         np.save(path, np.load(path)[1:])
     with pytest.raises(UserError, match="is damaged: delete"):
         load_recordings(episodes, [0], config, embedder)
-    with pytest.raises(UserError, match='choose touch_input "embedding"'):
-        load_recordings(episodes, [0], replace(config, touch_input="wrench"), embedder)
     blind = load_recordings(episodes, [0], replace(config, touch_dim=0, touch=""), None)
     assert blind.touch.shape == (4, 0)
 
 
 def test_two_sets_beside_each_other_share_no_embeddings(tmp_path: Path) -> None:
     embedder, touches = toy_touch_embedder(), []
-    config = replace(TOY, touch_dim=embedder.dim, touch_input="embedding")
+    config = replace(TOY, touch_dim=embedder.dim)
     for first in (0, 1):
         episodes = EpisodeSet(record_ticks(tmp_path / str(first), toy_observations(5)[first:][:4]))
         touches.append(load_recordings(episodes, [0], config, embedder).touch)

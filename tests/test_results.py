@@ -32,7 +32,7 @@ def test_a_record_is_complete_and_printed_by_its_benchmark(name: str, capsys) ->
     assert all(line in printed for line in record["printed"])
 
 
-@pytest.mark.parametrize("target", ["pick-place-policy", "maze-policy", "maze-wrench-policy"])
+@pytest.mark.parametrize("target", ["pick-place-policy", "maze-policy"])
 def test_no_two_recordings_share_a_seed(target: str) -> None:
     """A shared seed would be skipped without a word."""
     recorded, asked = set(), 0

@@ -12,7 +12,7 @@ from touchgoal.encoders.backbones.vit import PRESETS as VITS
 from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.heads.unet import PRESETS
-from touchgoal.policies.network import WRENCH_DIM, PolicyConfig, PolicyNetwork
+from touchgoal.policies.network import PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.training.sequence_dataset import Recordings, SequenceDataset
 
@@ -34,19 +34,15 @@ def toy_dataset(
     state = 0.02 * torch.randn(n, width, generator=generator)
     actions = 0.01 * torch.randn(n, 8, generator=generator)
     actions[:, 7] = 0.0  # a gripper that stays, as in the bead maze
-    wrench = touch.float().sum(1, keepdim=True).repeat(1, WRENCH_DIM)
     done = torch.cat([torch.arange(length) >= length - 10 for length in lengths])
-    wrench = wrench if config.reads_wrench else None
-    return SequenceDataset(Recordings(touch, state, actions, lengths, done, wrench=wrench), config)
+    return SequenceDataset(Recordings(touch, state, actions, lengths, done), config)
 
 
 def toy_policy(config: PolicyConfig, windows: SequenceDataset, seed: int = 0) -> PolicyNetwork:
     torch.manual_seed(seed)
     policy, recorded = PolicyNetwork(config), windows.recorded
     touch, actions = recorded.touch.float(), windows.actions
-    policy.fit_normalizers(
-        touch, recorded.state, windows.joints, actions, recorded.wrench, windows.action_is_pad
-    )
+    policy.fit_normalizers(touch, recorded.state, windows.joints, actions, windows.action_is_pad)
     return policy
 
 

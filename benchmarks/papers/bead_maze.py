@@ -137,8 +137,6 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
         inputs += ["end-to-end touch"] * (config.end_to_end is not None)
         episodes = checkpoint.POLICY_FORMAT.provenance(directory)["episodes"]
         name = f"{' and '.join(inputs) or 'state only'}, {episodes} demos"
-        if config.touch_dim and config.touch_input == "embedding":
-            name += ", not taught by wrenches"
         if isinstance(config.head, MLPConfig):
             name += ", regression"
         else:

@@ -1,6 +1,6 @@
 """Noise, drift, contact, markers, depth and force of one sensor, from its own frames."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice
@@ -84,14 +84,10 @@ class _Touch:
 
 
 def check_sensor(
-    frames: Iterable[Image],
-    sensor: SensorModel,
-    ball_radius: float | None = None,
-    on_frame: Callable[[Image, float, bool], None] | None = None,
+    frames: Iterable[Image], sensor: SensorModel, ball_radius: float | None = None
 ) -> SensorCheck:
     """Check the frames of one sensor in order, the first untouched; `ball_radius` (m) if known.
 
-    `on_frame` takes each later frame that is not torn, its contact strength (counts), and whether it touches.
     UserError if there are no frames, they are not this sensor's (`image_guard`), or show no
     marker grid.
     """
@@ -116,8 +112,6 @@ def check_sensor(
             continue
         dots.follow(frame)
         touching = detector.update(frame)
-        if on_frame is not None:
-            on_frame(frame, detector.strength, touching)
         if touching:
             background = detector.background.image.copy() if before is not None else background
             plain, rest = dots.painted(frame), dots.painted(background, at_rest=True)

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from touchgoal.control import features as ft
 from touchgoal.control.interfaces import Actor, Policy
 from touchgoal.control.tactile.light_gain import LightWatch
-from touchgoal.episodes.recording import EpisodeSpec, run
+from touchgoal.episodes.recording import OUTCOME_SECONDS, EpisodeSpec, run
 from touchgoal.policies.by_name import prepare_policy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
@@ -49,6 +49,7 @@ class Trial:
         light_change: largest change of a fingertip's light since the first image, as a share.
         episode: what distinguishes it, such as the object, its mass, or the wire.
         judged: verdict of a judge; "" without one.
+        late: s from the first success to the policy's word that it is done; None without both.
     """
 
     seed: int
@@ -64,6 +65,7 @@ class Trial:
     light_change: float
     episode: dict[str, Any]
     judged: str = ""
+    late: float | None = None
 
 
 @dataclass(frozen=True)
@@ -159,8 +161,8 @@ def run_trial(
     env = make_env(config)
     try:
         observation, info = env.reset(seed=spec.seed, options=spec.options)
-        keys = (ft.WRENCH, ft.TRUTH_PAD_WRENCH, ft.TRUTH_PROGRESS, ft.ACTION)
-        rows, light, failed = [], LightWatch(), []
+        keys = (ft.WRENCH, ft.TRUTH_PAD_WRENCH, ft.TRUTH_PROGRESS, ft.ACTION, ft.TRUTH_SUCCESS)
+        rows, light, failed, late = [], LightWatch(), [], None
         judging = judge(env) if judge else None
         last = {**observation, ft.ACTION: np.zeros(env.action_space.shape or ()), **info}
         try:
@@ -172,9 +174,13 @@ def run_trial(
                 if judging and judging.ended(last):
                     break
             failed = [GAVE_UP] * bool(actor.given_up) + [FALSELY_DONE] * actor.done
+            if actor.done and any(right := [bool(row[-1][0]) for row in rows]):
+                since_first = (len(rows) - 1 - right.index(True)) / config.control_hz
+                late = since_first - OUTCOME_SECONDS
         except RefusedError:
             rows, failed = [*rows, [last[key] for key in keys]], [REFUSED]
-        wrench, pads, progress, actions = (np.stack(column) for column in zip(*rows, strict=True))
+        columns = zip(*rows, strict=True)
+        wrench, pads, progress, actions, _ = map(np.stack, columns)
         force = np.linalg.norm(wrench[:, :3], axis=1)
         goal = env.goal if isinstance(env, PickPlace) else None
         away = None if goal is None else np.linalg.norm(last[ft.TRUTH_OBJECT_POSE][:2] - goal)
@@ -195,6 +201,7 @@ def run_trial(
             light_change=light.change,
             episode=env.episode_info(),
             judged=judging.verdict() if judging else "",
+            late=late,
         )
     finally:
         env.close()

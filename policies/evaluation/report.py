@@ -3,25 +3,20 @@
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from touchgoal.control import features as ft
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.tactile.light_gain import light_advice
-from touchgoal.control.tick_parts import parts_of
 from touchgoal.episodes.film import write_film
-from touchgoal.episodes.recording import EpisodeSpec, OnTick, record_with_film
+from touchgoal.episodes.recording import EpisodeSpec, record_with_film
 from touchgoal.policies.evaluation.evaluate import REFUSED, Evaluation, Trial
 from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.parallel.parallel_map import parallel_map
-from touchgoal.runtime.viewer.stream import RerunStream, open_rerun
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.scene.objects import SHAPES
 from touchgoal.sim_envs.scene.wires import FAMILIES
@@ -57,31 +52,18 @@ def record_trials(out: Path, trials: Iterator[Trial], count: int) -> list[Trial]
 
 
 def film_trials(
-    out: Path | None,
+    out: Path,
     task: TaskConfig,
     specs: Sequence[EpisodeSpec],
     trials: Sequence[Trial],
     policy: Callable[[Any], Actor],
     workers: int,
-    rerun: str | None = None,
 ) -> None:
-    """Run the worst, the median and the best episode again, film them and show them in rerun.
-
-    Args:
-        out: folder of the films; None for none.
-        rerun: target of `open_rerun`, which shows the episodes as they run, one after another; None
-            for none.
-    """
+    """Run the worst, the median and the best episode again, and film them into the folder `out`."""
     jobs = list(_chosen(specs, trials).items())
-    film = partial(_film, task, policy, out)
-    with ExitStack() as opened:
-        if rerun is None:
-            filmed = opened.enter_context(parallel_map(film, jobs, workers))
-        else:
-            stream = opened.enter_context(open_rerun(rerun))
-            filmed = map(film, jobs, (_shown_in(stream, name, task.control_hz) for name, _ in jobs))
+    with parallel_map(partial(_film, task, policy, out), jobs, workers) as filmed:
         for (name, spec), path in zip(jobs, filmed, strict=True):
-            print(f"{name} episode (seed {spec.seed}): {path or rerun}")
+            print(f"{name} episode (seed {spec.seed}): {path}")
 
 
 def _chosen(specs: Sequence[EpisodeSpec], trials: Sequence[Trial]) -> dict[str, EpisodeSpec]:
@@ -94,35 +76,15 @@ def _chosen(specs: Sequence[EpisodeSpec], trials: Sequence[Trial]) -> dict[str, 
 
 
 def _film(
-    task: TaskConfig,
-    policy: Callable[[Any], Actor],
-    out: Path | None,
-    job: tuple[str, EpisodeSpec],
-    on_tick: OnTick | None = None,
-) -> Path | None:
+    task: TaskConfig, policy: Callable[[Any], Actor], out: Path, job: tuple[str, EpisodeSpec]
+) -> Path:
     name, spec = job
     env = make_env(task)  # with the same images, because rendering them draws random numbers
-    episode, images = record_with_film(env, spec, policy, "fast", on_tick)
+    episode, images = record_with_film(env, spec, policy, "fast")
     env.close()
-    if out is None:
-        return None
     path = out / f"{name}.mp4"
     write_film(path, images, episode, task.control_hz)
     return path
-
-
-def _shown_in(stream: RerunStream, name: str, hz: int) -> OnTick:
-    """Return what logs each tick; where the front camera is not rendered, the film's scene is."""
-    frames = count()
-
-    def show(tick: dict[str, np.ndarray], image: np.ndarray) -> None:
-        images, scalars = parts_of(tick, name)
-        if ft.FRONT not in tick:
-            images = {f"{name}/scene": image[:, : len(image)], **images}
-        frame = next(frames)
-        stream.log(frame, frame / hz, images, scalars)
-
-    return show
 
 
 def _summary(trials: list[Trial]) -> dict[str, Any]:

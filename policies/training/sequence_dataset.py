@@ -37,7 +37,6 @@ class Recordings:
     lengths: tuple[int, ...]  # ticks of each episode
     done: Bool[Tensor, " n"]  # whether the task is done: the end of a successful episode
     images: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
-    wrench: Float32[Tensor, "n 12"] | None = None  # on both pads (N, Nm, pad frames), if trained on
     maps: Float16[Tensor, "n k c y x"] | None = None  # camera feature maps, see `ImageEmbedder`
     key_pose: Float32[Tensor, "n 3 8"] | None = None  # the last and the next two, beside `maps`
 
@@ -62,8 +61,7 @@ def load_recordings(
     images = ImageEmbedder(config.images) if config.images else None
     maps = embed_episodes(episodes, chosen, images, workers) if images else []
     keys = [*config.proprioception, ft.STATE, ft.ACTION]
-    keys += [ft.TRUTH_PAD_WRENCH] * config.reads_wrench
-    touch, state, actions, differences, wrench, tcp = [], [], [], [], [], []
+    touch, state, actions, differences, tcp = [], [], [], [], []
     for n, i in enumerate(track(chosen, "reading", "episode")):
         frames = episodes.read(i, keys).frames
         if ft.WRENCH in frames:
@@ -74,8 +72,6 @@ def load_recordings(
         if images:
             tcp.append(frames[ft.TCP_POSE][start:])
             maps[n] = maps[n][start:]
-        if config.reads_wrench:
-            wrench.append(frames[ft.TRUTH_PAD_WRENCH][start:])
         no_touch = np.empty((len(actions[-1]), 0), np.float16)
         touch.append(embedded[n][start:] if embedded else no_touch)
         if config.end_to_end:
@@ -93,7 +89,6 @@ def load_recordings(
         lengths=lengths,
         done=_done(episodes, chosen, lengths, config.control_hz),
         images=torch.from_numpy(np.concatenate(differences)) if config.end_to_end else None,
-        wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
         maps=torch.from_numpy(np.concatenate(maps)) if images else None,
         key_pose=key_pose,
     )
@@ -128,11 +123,6 @@ def _check(
     reads = {*config.proprioception, *(config.images.cameras if config.images else ())}
     if missing := reads - set(episodes.features):
         raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy reads")
-    if config.reads_wrench and ft.TRUTH_PAD_WRENCH not in episodes.features:
-        raise UserError(
-            f"{episodes.root} has no {ft.TRUTH_PAD_WRENCH}, which only simulated episodes have: "
-            'choose touch_input "embedding"'
-        )
     made = (embedder.name, embedder.dim) if embedder else ("", 0)
     if made != (config.touch, config.touch_dim):
         raise UserError(
@@ -211,11 +201,6 @@ class SequenceDataset:
             recorded.touch[observed].float(), recorded.state[observed], images, maps
         )
         return batch, recorded.actions[self._planned[rows]]
-
-    def wrench(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b o 12"] | None:
-        """Return the wrenches on both pads in some windows, if they were read."""
-        wrench = self.recorded.wrench
-        return None if wrench is None else wrench[self._observed[rows]]
 
     def key_pose(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b 3 8"] | None:
         """Return the key poses at the latest tick of some windows, with cameras."""

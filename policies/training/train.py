@@ -26,7 +26,7 @@ POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
 BETAS, WEIGHT_DECAY = (0.95, 0.999), 1e-6  # of AdamW, as in diffusion_policy
 _WARMUP_STEPS = 500  # as there; a tenth of a training that is shorter
 _SEEN = "touch", "state", "images", "maps"  # of a batch, by the policy as it acts
-_LEARNED = "actions", "noise", "wrench", "action_is_pad", "key_pose"  # and by the loss alone
+_LEARNED = "actions", "noise", "action_is_pad", "key_pose"  # and by the loss alone
 _VALIDATION_WINDOWS = 1024  # evenly spaced, for the losses
 
 
@@ -107,7 +107,7 @@ def untrained(policy: PolicyConfig, windows: SequenceDataset, seed: int) -> Poli
         network = PolicyNetwork(policy)
     network.fit_normalizers(
         recorded.touch.float(), recorded.state, windows.joints, windows.actions,
-        recorded.wrench, windows.action_is_pad, recorded.maps, recorded.key_pose,
+        windows.action_is_pad, recorded.maps, recorded.key_pose,
     )  # fmt: skip
     network.fit_novelty(recorded.touch.float(), recorded.lengths)
     return network
@@ -145,7 +145,6 @@ def make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, A
         "state": observed.state,
         "images": observed.images,
         "maps": observed.maps,
-        "wrench": windows.wrench(rows),
         "actions": actions,
         "action_is_pad": windows.action_is_pad[rows],
         "key_pose": windows.key_pose(rows),
@@ -185,7 +184,7 @@ def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dic
 def _checksum(windows: SequenceDataset) -> str:
     recorded = windows.recorded
     return checksum(
-        recorded.touch, recorded.state, recorded.actions, recorded.images, recorded.wrench,
+        recorded.touch, recorded.state, recorded.actions, recorded.images,
         recorded.maps, recorded.key_pose, recorded.done, map(str, recorded.lengths), windows.weights,
     )  # fmt: skip
 
