@@ -71,7 +71,7 @@ BENCHMARKS = {
     ),
     "faults": ("deployment.faults", "what a deployment does under every fault"),
     "policy-ends": ("deployment.policy_ends", "whether policies say when they are done"),
-    "policy-delay": ("deployment.policy_delay", "success under delays, or by cause of failure"),
+    "policy-delay": ("deployment.policy_delay", "success under delays"),
     "own-task": ("deployment.own_task", "a task known by demonstrations alone: success by sight"),
     "audit": ("deployment.audit", "success with touch removed, shuffled, or of another fingertip"),
     "robustness": ("deployment.robustness", "success under changes that training has not shown"),

@@ -1,5 +1,6 @@
 """The figure of a record in one line, from what its command wrote to metrics.json."""
 
+from collections import Counter
 from typing import Any
 
 from touchgoal.policies.evaluation.success_rate import SuccessRate
@@ -39,20 +40,14 @@ def looks(metrics: Metrics) -> str:
 
 
 def mended(metrics: Metrics) -> str:
-    """Success of every row, and in how many trials the policy gave up."""
+    """Success of every row, and in how many trials the policy gave up, or ended falsely as done."""
     rows = []
     for row in metrics["rows"]:
-        gave_up = sum(trial["failure"] == "gave up" for trial in row["trials"])
-        rows.append(f"{row['what'].split(', ')[1]} {_rate(row['trials'])}, {gave_up} gave up")
-    return "; ".join(rows)
-
-
-def ended(metrics: Metrics) -> str:
-    """Success of every row, and how many failures the policy called done."""
-    rows = []
-    for row in metrics["rows"]:
-        falsely = sum(trial["failure"] == "falsely done" for trial in row["trials"])
-        rows.append(f"{row['what']} {_rate(row['trials'])}, falsely {falsely}")
+        failures = Counter(trial["failure"] for trial in row["trials"])
+        told = [
+            f", {failures[how]} {how}" for how in ("gave up", "falsely done") if how in failures
+        ]
+        rows.append(f"{row['what'].split(', ')[1]} {_rate(row['trials'])}{''.join(told)}")
     return "; ".join(rows)
 
 
