@@ -145,14 +145,21 @@ class Still(Actor):
 
 
 @pytest.mark.parametrize(
-    ("request_", "success", "outcome"),
-    [("done", True, "success"), ("not done", False, "failure"), ("", False, "failure")],
+    ("policy", "request_", "success", "outcome"),
+    [
+        ("expert", "done", True, "success"),
+        ("expert", "not done", False, "failure"),
+        ("expert", "", False, "failure"),
+        ("own", "", True, "success"),  # it says that it is done: the operator is asked
+        ("own", "", None, "unknown"),
+    ],
 )
 def test_without_a_simulator_the_operator_says_whether_it_is_done(
-    request_: Request, success: bool | None, outcome: str, tmp_path: Path
+    policy: str, request_: Request, success: bool | None, outcome: str, tmp_path: Path
 ) -> None:
     """A plan that ends by itself with an empty hand is a failure."""
     cell, connection = read_cell_file(write_cell_file(tmp_path, SIM)), FakeCell().connection()
+    cell = replace(cell, task=replace(cell.task, policy=policy))
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ)
     actor, ticks = Still(), []
 
@@ -164,7 +171,8 @@ def test_without_a_simulator_the_operator_says_whether_it_is_done(
         return request_ if len(ticks) > 2 else ""
 
     recorder = EpisodeRecorder(tmp_path / "episodes", ft.CONTROL_HZ)
-    session = Session(cell, connection, safety, recorder, True, lambda _: actor, wanted, on_tick)
+    made = recorder, True, lambda _: actor, wanted, on_tick
+    session = Session(cell, connection, safety, *made, ask=lambda _: success)
     assert session.run().success is success
     meta = EpisodeSet(tmp_path / "episodes").meta(0)
     assert meta["outcome"] == outcome and meta.get("success") is success

@@ -102,7 +102,7 @@ class Session:
             return self._run()
 
     def _run(self) -> Result:
-        # Scripts end by themselves; for other actors only a simulator knows when the task is done.
+        # Scripts end by themselves; a simulator tells first when the task of other actors is done.
         scripted = self.cell.task.policy == "expert"
         truth = None if scripted else self._truth
         log = RunLog(self.recorder.add) if self.execute else RunLog()
@@ -143,8 +143,10 @@ class Session:
     def _judge(
         self, ending: Ending, loop: ControlLoop, log: RunLog
     ) -> tuple[Ending, CostReading | None]:
-        """Ask the judge, and a person where it is unsure, how a run ended that nobody has ended."""
+        """Ask the judge, and a person without one or where it is unsure, how a run ended by itself."""
         if self.cost is None or not self.execute or not self.cell.task.judge:
+            if ending == Ending(PLAN_ENDED) and self.execute and self._truth is None:
+                ending = replace(ending, done=self.ask("the policy says that the task is done"))
             return ending, None
         if ending.reason == PLAN_ENDED or ending.reason.startswith(TIME_UP):
             still = ScriptedActor(
