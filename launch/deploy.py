@@ -178,23 +178,31 @@ def _deploy(
 
 
 def _shown_in(stream: RerunStream, dt: float) -> "Callable[[TickStatus], None]":
-    """Return what logs a tick of `dt` (s), its command as an episode's action."""
+    """Return what logs a tick of `dt` (s): images, and curves of force, hand, command and cost."""
     import numpy as np
 
     from touchgoal.control import features as ft
-    from touchgoal.control.tick_parts import parts_of
 
     def show(status: "TickStatus") -> None:
-        tick = {**status.reading.observation}
-        tick[ft.ACTION] = np.append(status.state.velocity * dt, status.width)
+        seen = status.reading.observation
+        images = {
+            key.removeprefix(ft.IMAGE_PREFIX): image
+            for key, image in seen.items()
+            if key.startswith(ft.IMAGE_PREFIX)
+        }
+        curves = {
+            "force (N)/force": float(np.linalg.norm(seen[ft.WRENCH][:3])),
+            "gripper width (mm)/measured": 1e3 * seen[ft.STATE][-1],
+            "gripper width (mm)/commanded": 1e3 * status.width,
+        }
+        changes = enumerate(status.state.velocity * dt, 1)
+        curves |= {f"joint change (rad)/joint_{i}": change for i, change in changes}
         if status.cost is not None:
-            tick[ft.COST] = np.array([status.cost.cost])
-        images, scalars = parts_of(tick)
+            curves["cost/cost"] = status.cost.cost
         for key, depth in zip(ft.TACTILE, status.reading.indentation, strict=True):
-            if key in tick:
-                curve = key.removeprefix(ft.IMAGE_PREFIX)
-                scalars[f"indentation (mm)/{curve}"] = 1e3 * depth
-        stream.log(status.seconds, images, scalars)
+            if key in seen:
+                curves[f"indentation (mm)/{key.removeprefix(ft.IMAGE_PREFIX)}"] = 1e3 * depth
+        stream.log(status.seconds, images, {path: float(value) for path, value in curves.items()})
 
     return show
 

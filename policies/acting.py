@@ -157,7 +157,9 @@ class LearnedPolicy(Planner):
             self._refuse_novel(batch)
             rest = self._generator, self._width, self._key_pose
             actions = self._network.plan(batch, *rest)[0].numpy()
-            self._notice_end(batch)
+            done = self._network.end_of(batch, self._key_pose) > 1
+            self._done_plans = self._done_plans + 1 if done else 0
+            self.done = self._done_plans * self.execution_horizon >= DONE_SECONDS * self.control_hz
             # The last action of a plan comes a tick and `execution_horizon` ticks after its
             # observation. The whole motion is done where no age is known.
             reaction = (1 + self.execution_horizon) / self.control_hz
@@ -195,12 +197,6 @@ class LearnedPolicy(Planner):
                 f"for a second touch has been unlike all of the training ({novelty:.1f} times "
                 "as far from it as accepted): look for what has changed since the recordings"
             )
-
-    def _notice_end(self, batch: ObservationBatch) -> None:
-        """Be done once the task has been for `DONE_SECONDS` of plans."""
-        done = self._network.end_of(batch, self._key_pose) > 1
-        self._done_plans = self._done_plans + 1 if done else 0
-        self.done = self._done_plans * self.execution_horizon >= DONE_SECONDS * self.control_hz
 
     def embed(self, history: Sequence[Observation], /) -> None:
         """Embed observations before `plan` needs them: most of the work."""

@@ -10,15 +10,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import pairwise
-from typing import Any, cast, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from benchmarks.deployment.trials import (
     TABLE_HEAD,
     UNCHANGED,
-    DeployedOptions,
     TrialOptions,
+    deployed,
     table_row,
 )
 from touchgoal.control import features as ft
@@ -64,10 +64,9 @@ class _Watched(Actor):
 
 def run(config: Config) -> dict[str, Any]:
     """Return success and force by task and change of touch, with the trials."""
-    lines, rows, served = [TABLE_HEAD], [], DeployedOptions()
+    lines, rows = [TABLE_HEAD], []
     for task in config.tasks:
-        is_served = task in get_args(SimulatedTask)
-        wanted = served.environment(cast(SimulatedTask, task)) if is_served else ENVS[task]
+        wanted = deployed(task) if task in get_args(SimulatedTask) else ENVS[task]
         make, env = prepare_policy(config.policy, wanted)
         pairs = list(pairwise(trial_specs(env, config.episodes + 1, config.seed)))
         with parallel_map(partial(_audit, env, make), pairs, config.workers) as found:

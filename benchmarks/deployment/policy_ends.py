@@ -8,10 +8,10 @@ from dataclasses import asdict, replace
 from typing import Any, get_args
 
 from benchmarks.deployment.robustness import CHANGES
-from benchmarks.deployment.trials import TABLE_HEAD, UNCHANGED, TrialOptions, table_row
+from benchmarks.deployment.trials import TABLE_HEAD, UNCHANGED, TrialOptions, deployed, table_row
 from touchgoal.policies.evaluation.evaluate import FALSELY_DONE, evaluate
 from touchgoal.runtime.option_types import checked_dataclass
-from touchgoal.sim_envs.config import ENVS, BeadMazeConfig, TaskConfig, TaskName
+from touchgoal.sim_envs.config import TaskConfig, TaskName
 
 _INTERFERENCES = "object taken away", "object knocked out of the hand"
 _SOON = 2.0  # s
@@ -42,10 +42,7 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _cases(task: TaskName) -> list[tuple[str, TaskConfig]]:
-    base = replace(ENVS[task], as_deployed=True, ends_by_success=False)
-    if isinstance(base, BeadMazeConfig):
-        base = replace(base, split="test", start_angle=10.0)
-    changes = {name: CHANGES[task][name] for name in _INTERFERENCES} if task == "pick-place" else {}
-    return [(f"{task}, {UNCHANGED}", base)] + [
-        (f"{task}, {name}", replace(base, **change)) for name, change in changes.items()
-    ]
+    base = replace(deployed(task), ends_by_success=False)
+    changes = {UNCHANGED: {}}
+    changes |= {name: CHANGES[task][name] for name in _INTERFERENCES if task == "pick-place"}
+    return [(f"{task}, {name}", replace(base, **change)) for name, change in changes.items()]

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.deployment.first_look import changed_camera
-from benchmarks.deployment.trials import UNCHANGED, DeployedOptions, try_cases
+from benchmarks.deployment.trials import UNCHANGED, DeployedOptions, deployed, try_cases
 from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
@@ -79,7 +79,7 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _environments(config: Config, task: SimulatedTask) -> dict[str, TaskConfig]:
-    base = config.environment(task)
+    base = replace(deployed(task), as_deployed=config.as_deployed)
     late = {
         name: replace(
             base,

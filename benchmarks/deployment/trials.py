@@ -14,7 +14,7 @@ from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy
 from touchgoal.policies.evaluation.evaluate import GAVE_UP, REFUSED, Evaluation, evaluate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
-from touchgoal.sim_envs.config import ENVS, BeadMazeConfig, PickPlaceConfig, TaskConfig
+from touchgoal.sim_envs.config import ENVS, BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
 UNCHANGED = "unchanged"  # row of a table
 TABLE_HEAD = f"{'':<46}{'success [95 % Wilson]':<24}{'peak force N, mean':>19}{'sd':>6}{'max':>6}"
@@ -43,12 +43,13 @@ class DeployedOptions(TrialOptions):
     as_deployed: bool = True
     """Let the arm behave as deployed."""
 
-    def environment(self, task: SimulatedTask) -> TaskConfig:
-        """Return a task's options: of the maze test wires, the hand up to 10 degrees askew."""
-        base = replace(ENVS[task], as_deployed=self.as_deployed)
-        if isinstance(base, BeadMazeConfig):
-            return replace(base, split="test", start_angle=10.0)
-        return base
+
+def deployed(task: TaskName) -> TaskConfig:
+    """Return a task as deployed: of the maze test wires, the hand up to 10 degrees askew."""
+    base = replace(ENVS[task], as_deployed=True)
+    if isinstance(base, BeadMazeConfig):
+        return replace(base, split="test", start_angle=10.0)
+    return base
 
 
 def try_cases(config: TrialOptions, cases: Iterable[tuple[str, TaskConfig]]) -> dict[str, Any]:
