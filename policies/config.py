@@ -97,9 +97,8 @@ class PoseEstimatorConfig:
     # Least share of the first look near the object and near the goal, least length of the vector of the
     # yaw, and least probability of an unmirrored image, in which the estimate is trusted; training sets them.
     sure: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    # Most share of the first look at another place than the object's, without a sentence and with one;
-    # training sets it.
-    second: tuple[float, float] = (1.0, 1.0)
+    # Most share of the first look at another place than the object's, without a sentence; training sets it.
+    second: float = 1.0
     front_camera: CameraPlacement = USUAL_CAMERA  # where it stood in training, up to its changes
 
 

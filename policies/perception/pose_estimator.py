@@ -25,6 +25,7 @@ _PATCH = 4  # px between two cells of a crop
 _CELL = 8  # px between two cells of a finder's map
 _PEAK = 1.5  # cells around a map's maximum over which the place is averaged
 _APART = 3.0  # cells between a place and the next one
+_NEAR, _LEAST_GAIN = 40.0, -1.5  # px; a clearly better place far away still wins
 # Centre of the first cell, px: that of the 8 pixels of its patch, which begin at -2.
 _FIRST = 1.5
 _SHIFT = 0.1  # m, unit of the camera's shift
@@ -106,9 +107,21 @@ class PoseEstimator(nn.Module):
             known.append(scene(halved, middle.expand(len(halved), -1)))
         return torch.cat(known, 1)
 
-    def look(self, lit: Images, words: Float[Tensor, "b d"], scene: Float[Tensor, "b s"]) -> Look:
-        """Find object and goal in evenly lit images; `scene` may be of the episode's first images."""
+    def look(
+        self,
+        lit: Images,
+        words: Float[Tensor, "b d"],
+        scene: Float[Tensor, "b s"],
+        before: Places | None = None,
+    ) -> Look:
+        """Find object and goal in evenly lit images; `scene` may be of the episode's first images.
+
+        Of two objects that the words fit equally, it is the one nearer to where it was `before`.
+        """
         scores = self.scores(lit, words)
+        if before:
+            crops = self.config.crops
+            scores = {key: scores[key] + _nearness(before[key], box) for key, box in crops}
         found = {key: _find(scores[key], box) for key, box in self.config.crops}
         places = {key: place for key, (place, _, _) in found.items()}
         start = self.start_normalizer.inverse(self.scaled(lit, scene, places))
@@ -204,6 +217,12 @@ def _centres(box: Box) -> Float[Tensor, "y x 2"]:
     top, bottom, left, right = box
     rows, columns = torch.arange(top, bottom, _CELL), torch.arange(left, right, _CELL)
     return _FIRST + torch.stack(torch.meshgrid(rows, columns, indexing="ij"), -1)
+
+
+def _nearness(places: Float[Tensor, "b 2 2"], box: Box) -> Float[Tensor, "b 2 y x"]:
+    """Return what each cell's score gains by its nearness to these places, at most 0."""
+    far = (places[:, :, None, None] - _centres(box).to(places)).norm(dim=-1)
+    return (-(far / _NEAR).square() / 2).clamp(min=_LEAST_GAIN)
 
 
 def _find(

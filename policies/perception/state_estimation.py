@@ -16,7 +16,13 @@ from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.config import PoseEstimatorConfig
-from touchgoal.policies.perception.pose_estimator import Images, Look, PoseEstimator, evenly_lit
+from touchgoal.policies.perception.pose_estimator import (
+    Images,
+    Look,
+    Places,
+    PoseEstimator,
+    evenly_lit,
+)
 from touchgoal.policies.perception.target_words import WORDS_WIDTH, embed
 from touchgoal.policies.perception.usual_view import UsualView
 from touchgoal.runtime.errors import RefusedError, UserError
@@ -75,7 +81,7 @@ class StateEstimator:
         self.cameras = tuple(key for key, _ in pose_estimator.config.crops)
         self._words = embed([target]) if target else torch.zeros(1, WORDS_WIDTH)
         self._first: Mapping[str, np.ndarray] | None = None
-        self._scene = torch.empty(1, 0)
+        self._scene, self._places = torch.empty(1, 0), Places()
         self._start = self._latest = np.empty(0, np.float32)
         self._contact: dict[str, ContactDetector] = {}
         self._touched, self._least = False, pose_estimator.config.sure
@@ -113,11 +119,9 @@ class StateEstimator:
                 raise RefusedError(
                     f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): {remedy}"
                 )
-        if look.second[0, 0] > self.pose_estimator.config.second[bool(self.target)]:
-            meant = f"'{self.target}'" if self.target else "what is meant"
-            raise RefusedError(
-                f"several objects may be {meant}: say which one, so that it fits no other (--target)"
-            )
+        if not self.target and look.second[0, 0] > self.pose_estimator.config.second:
+            raise RefusedError("several objects may be what is meant: say which one (--target)")
+        self._places = look.places
         self._start = self._latest = _unit_yaw(look.start[0].numpy())
         self._check_camera(look, first)
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
@@ -129,7 +133,8 @@ class StateEstimator:
 
         The camera's pose is taken from the first images, in which nothing moves.
         """
-        look = self.pose_estimator.look(self._images(observation), self._words, self._scene)
+        seen = self._images(observation), self._words, self._scene
+        look = self.pose_estimator.look(*seen, self._places)
         if np.less(look.sureness[0].numpy(), self._least).any():
             return
         now, before = _unit_yaw(look.start[0].numpy()), self._latest
@@ -138,6 +143,7 @@ class StateEstimator:
         if moved and np.linalg.norm(now[:2] - before[:2]) < _AGREE:
             object_ = _unit_yaw((now + before) / 2)[:_OBJECT]
             self._start = np.concatenate([object_, self._start[_OBJECT:]])
+            self._places = look.places
 
     def _check_camera(self, look: Look, first: Mapping[str, np.ndarray]) -> None:
         """Refuse a first look at the edge of the image, or that the calibrated camera sees elsewhere."""
