@@ -190,15 +190,14 @@ def _shown_in(stream: RerunStream, dt: float) -> "Callable[[TickStatus], None]":
             for key, image in seen.items()
             if key.startswith(ft.IMAGE_PREFIX)
         }
-        curves = {
+        curves = {"cost/cost": status.cost.cost} if status.cost is not None else {}
+        curves |= {
             "force (N)/force": float(np.linalg.norm(seen[ft.WRENCH][:3])),
             "gripper width (mm)/measured": 1e3 * seen[ft.STATE][-1],
             "gripper width (mm)/commanded": 1e3 * status.width,
         }
         changes = enumerate(status.state.velocity * dt, 1)
         curves |= {f"joint change (rad)/joint_{i}": change for i, change in changes}
-        if status.cost is not None:
-            curves["cost/cost"] = status.cost.cost
         for key, depth in zip(ft.TACTILE, status.reading.indentation, strict=True):
             if key in seen:
                 curves[f"indentation (mm)/{key.removeprefix(ft.IMAGE_PREFIX)}"] = 1e3 * depth

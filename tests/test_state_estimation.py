@@ -150,6 +150,18 @@ def test_a_place_is_learnt_and_words_choose(tmp_path: Path) -> None:
         assert off.norm(dim=1).median() < 0.02  # 0.12 by chance
 
 
+def test_of_two_objects_that_fit_equally_the_one_before_is_kept() -> None:
+    sight, scores = PoseEstimator(SMALL).eval(), torch.full((1, 2, 4, 4), -5.0)
+    scores[..., 0, 0] = scores[..., 3, 3] = 3.0
+    sight.scores = lambda *_: {ft.FRONT: scores}  # type: ignore[method-assign]
+    lit = {ft.FRONT: torch.zeros(1, 32, 32, 3, dtype=torch.uint8)}
+    scene = sight.scene(lit, torch.zeros(1, 7), torch.zeros(1, 3))
+    for end in (1.5, 25.5):
+        before = {ft.FRONT: torch.full((1, 2, 2), end)}
+        found = sight.look(lit, torch.zeros(1, WORDS_WIDTH), scene, before).places[ft.FRONT]
+        torch.testing.assert_close(found, before[ft.FRONT], atol=0.1, rtol=0)
+
+
 def test_a_sentence_fits_its_object_alone() -> None:
     rng = np.random.default_rng(0)
     looks = [

@@ -132,7 +132,7 @@ def lay_out(images: Collection[str], scalars: Collection[str]) -> Any:
         plots.setdefault(path.rpartition("/")[0], []).append(path)
     curves = views.Vertical(*(_plot(plot, paths) for plot, paths in plots.items()))
     time = views.TimePanel(timeline="time", state="collapsed")
-    both = views.Horizontal(views.Vertical(*reversed(rows)), curves)
+    both = views.Horizontal(views.Vertical(*reversed(rows)), curves, name="arm")
     return views.Blueprint(both, time, collapse_panels=True)
 
 
