@@ -47,7 +47,7 @@ def mended(metrics: Metrics) -> str:
         told = [
             f", {failures[how]} {how}" for how in ("gave up", "falsely done") if how in failures
         ]
-        rows.append(f"{row['what'].split(', ')[1]} {_rate(row['trials'])}{''.join(told)}")
+        rows.append(f"{row['what']} {_rate(row['trials'])}{''.join(told)}")
     return "; ".join(rows)
 
 

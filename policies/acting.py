@@ -157,7 +157,7 @@ class LearnedPolicy(Planner):
             self._refuse_novel(batch)
             rest = self._generator, self._width, self._key_pose
             actions = self._network.plan(batch, *rest)[0].numpy()
-            done = self._network.end_of(batch, self._key_pose) > 1
+            done = self._network.is_done(batch, self._key_pose)
             self._done_plans = self._done_plans + 1 if done else 0
             self.done = self._done_plans * self.execution_horizon >= DONE_SECONDS * self.control_hz
             # The last action of a plan comes a tick and `execution_horizon` ticks after its

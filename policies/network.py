@@ -195,15 +195,13 @@ class PolicyNetwork(nn.Module):
         return self.novelty(batch.touch[:1, -1]).item() if self.novelty else 0.0
 
     @torch.inference_mode()
-    def end_of(self, batch: ObservationBatch, average: KeyPoseAverage | None = None) -> float:
-        """Return whether the first observation says that the task is done: above 1; 0 if it never says.
-
-        With cameras it needs the `average` that the plan was made with.
-        """
+    def is_done(self, batch: ObservationBatch, average: KeyPoseAverage) -> bool:
+        """Return whether the first observation looks like the task's end, by the plan's `average`."""
         if self.end is None:
-            return 0.0
-        pose = average.latest if average and self.key_pose else None
-        return self.end(self._encode(batch, self._encode_touch(batch), pose))[0].item()
+            return False
+        pose = average.latest if self.key_pose else None
+        found = self.end(self._encode(batch, self._encode_touch(batch), pose))
+        return bool(found[0] > self.end.limit)
 
     def condition(
         self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"] | None = None

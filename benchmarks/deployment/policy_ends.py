@@ -4,12 +4,11 @@ Then it rests for a second, and the simulator tells the outcome. Also with the o
 the hand, where the policy must mend that, or at least not call it done.
 """
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any, get_args
 
 from benchmarks.deployment.robustness import CHANGES
-from benchmarks.deployment.trials import TABLE_HEAD, UNCHANGED, TrialOptions, deployed, table_row
-from touchgoal.policies.evaluation.evaluate import FALSELY_DONE, evaluate
+from benchmarks.deployment.trials import UNCHANGED, TrialOptions, deployed, try_cases
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.sim_envs.config import TaskConfig, TaskName
 
@@ -27,18 +26,13 @@ class Config(TrialOptions):
 
 def run(config: Config) -> dict[str, Any]:
     """Return success and ends of every task, with the trials."""
-    lines, rows = [TABLE_HEAD], []
-    count, seed, workers = config.episodes, config.seed, config.workers
-    for what, env in (case for task in config.tasks for case in _cases(task)):
-        result = evaluate(config.policy, env, episodes=count, seed=seed, workers=workers)
-        late = [abs(t.late) for t in result.trials if t.success and t.late is not None]
-        falsely = sum(t.failure == FALSELY_DONE for t in result.trials)
-        unsaid = sum(t.success for t in result.trials) - len(late)
-        soon = sum(seconds <= _SOON for seconds in late)
-        said = f"; falsely done {falsely}, not said {unsaid}, within {_SOON:g} s {soon}/{len(late)}"
-        lines.append(table_row(what, result) + said)
-        rows.append({"what": what, "trials": [asdict(trial) for trial in result.trials]})
-    return {"table": "\n".join(lines), "rows": rows}
+    found = try_cases(config, (case for task in config.tasks for case in _cases(task)))
+    lines = [found["table"]]
+    for row in found["rows"]:
+        late = [t["late"] for t in row["trials"] if t["success"]]
+        soon = sum(seconds is not None and abs(seconds) <= _SOON for seconds in late)
+        lines.append(f"{row['what']}: {soon} of {len(late)} successes ended within {_SOON:g} s")
+    return {**found, "table": "\n".join(lines)}
 
 
 def _cases(task: TaskName) -> list[tuple[str, TaskConfig]]:

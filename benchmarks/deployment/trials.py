@@ -1,6 +1,7 @@
 """Success and force of one policy in several environments; all rows of a task share their seeds."""
 
 import sys
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, replace
 from typing import Any, get_args
@@ -11,12 +12,19 @@ from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.policies.by_name import choose_policy
 from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy
-from touchgoal.policies.evaluation.evaluate import GAVE_UP, REFUSED, Evaluation, evaluate
+from touchgoal.policies.evaluation.evaluate import (
+    FALSELY_DONE,
+    GAVE_UP,
+    REFUSED,
+    Evaluation,
+    evaluate,
+)
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import ENVS, BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
 UNCHANGED = "unchanged"  # row of a table
+_TOLD = REFUSED, GAVE_UP, FALSELY_DONE  # failures that a row counts
 TABLE_HEAD = f"{'':<46}{'success [95 % Wilson]':<24}{'peak force N, mean':>19}{'sd':>6}{'max':>6}"
 
 
@@ -83,7 +91,6 @@ def table_row(what: str, result: Evaluation) -> str:
     """Return a line of the table under `TABLE_HEAD`."""
     peak = [trial.peak_force for trial in result.trials]
     force = f"{np.mean(peak):>19.1f}{np.std(peak):>6.1f}{max(peak):>6.1f}"
-    refused = sum(trial.failure == REFUSED for trial in result.trials)
-    gave_up = sum(trial.failure == GAVE_UP for trial in result.trials)
-    told = [f"  {n} {how}" for n, how in ((refused, REFUSED), (gave_up, GAVE_UP)) if n]
+    failures = Counter(trial.failure for trial in result.trials)
+    told = [f"  {failures[how]} {how}" for how in _TOLD if how in failures]
     return "".join([f"{what:<46}{result!s:<24}{force}", *told])

@@ -13,10 +13,10 @@ _WIDTH = 64
 
 
 class EndOutput(nn.Module):
-    """Probability that the task is done, as a share of the limit above which it counts as done.
+    """Probability that the task is done; above `limit` it counts as done.
 
     It is fitted to a trained policy (`training/end.py`), which it leaves as it is. Until then, and where
-    the end looks like what comes before, the limit is infinite: nothing is done.
+    the end looks like what comes before, the limit is infinite.
     """
 
     def __init__(self, inputs: int) -> None:
@@ -29,10 +29,6 @@ class EndOutput(nn.Module):
         """Return what the network reads: of variance 1, without extremes."""
         return ((condition - self.mean) / self.scale).clamp(-5, 5)
 
-    def probability(self, condition: Float[Tensor, "b c"]) -> Float[Tensor, " b"]:
-        """Return the probability that the task is done."""
-        return self.network(self.scaled(condition))[:, 0].sigmoid()
-
     def forward(self, condition: Float[Tensor, "b c"]) -> Float[Tensor, " b"]:
-        """Return its share of the limit; above 1: done."""
-        return self.probability(condition) / self.limit
+        """Return the probability."""
+        return self.network(self.scaled(condition))[:, 0].sigmoid()

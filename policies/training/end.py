@@ -51,7 +51,7 @@ def _set_limit(
 ) -> tuple[int, int]:
     recorded, hz = validation.recorded, policy.config.control_hz
     last, before = [], [_LEAST]
-    found = end.probability(_conditions(policy, validation))
+    found = end(_conditions(policy, validation))
     lengths = list(recorded.lengths)
     for episode, done in zip(found.split(lengths), recorded.done.split(lengths), strict=True):
         lasting = episode.unfold(0, min(round(_LASTING * hz), len(episode)), 1).amin(1)

@@ -98,12 +98,10 @@ def _done(
     episodes: EpisodeSet, chosen: Sequence[int], lengths: Sequence[int], hz: int
 ) -> Bool[Tensor, " n"]:
     """Return the last `END_SECONDS` of each episode but those corrected ones that failed."""
-    parts, ticks = [], round(END_SECONDS * hz)
-    for i, length in zip(chosen, lengths, strict=True):
-        meta = episodes.meta(i)
-        failed = meta.get("outcome") == CORRECTED and not meta.get("success")
-        parts.append((torch.arange(length) >= length - ticks) & (not failed))
-    return torch.cat(parts)
+    metas, ticks = [episodes.meta(i) for i in chosen], round(END_SECONDS * hz)
+    good = [meta.get("outcome") != CORRECTED or bool(meta.get("success")) for meta in metas]
+    ends = zip(lengths, good, strict=True)
+    return torch.cat([(torch.arange(n) >= n - ticks) & success for n, success in ends])
 
 
 def _check(
