@@ -31,17 +31,16 @@ class SceneRecorder:
         self._ticks = 0
         self._images: list[np.ndarray] = []
 
-    def capture(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the newest image; call it once per tick, every second call draws one."""
+    def capture(self) -> None:
+        """Film a tick; every second call draws an image."""
         self._ticks += 1
         if self._ticks % TICKS_PER_IMAGE != 1:
-            return self._images[-1]
+            return
         self._data.qpos[:] = self._env.data.qpos
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, "front")
         touch = [frame.image for frame in self._env.tactile_frames]
         self._images.append(_beside(self._renderer.render(), touch))
-        return self._images[-1]
 
     @property
     def images(self) -> UInt8[np.ndarray, "n h w 3"]:
