@@ -70,7 +70,6 @@ BENCHMARKS = {
         "what pick-and-place finds under changes of camera, table and light",
     ),
     "faults": ("deployment.faults", "what a deployment does under every fault"),
-    "policy-ends": ("deployment.policy_ends", "whether policies say when they are done"),
     "policy-delay": ("deployment.policy_delay", "success under delays"),
     "own-task": ("deployment.own_task", "a task known by demonstrations alone: success by sight"),
     "audit": ("deployment.audit", "success with touch removed, shuffled, or of another fingertip"),

@@ -5,14 +5,14 @@ it: `--policy expert`, `--policy follower`.
 """
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 from benchmarks.deployment.first_look import changed_camera
-from benchmarks.deployment.trials import UNCHANGED, DeployedOptions, deployed, try_cases
+from benchmarks.deployment.trials import UNCHANGED, TrialOptions, deployed, try_cases
 from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
-from touchgoal.sim_envs.config import TaskConfig
+from touchgoal.sim_envs.config import TaskConfig, TaskName
 from touchgoal.sim_envs.scene.lighting import Lighting
 from touchgoal.sim_envs.scene.objects import NEW_KINDS
 from touchgoal.sim_envs.scene.wires import HELD_OUT
@@ -25,8 +25,9 @@ _DELAYED = {  # state and images; at 20 Hz a tick is 50 ms; learned policies go 
     for ticks, s in ((2, 0.1), (4, 0.2))
 }
 _LONGER = 1.5  # factor on the time limit of an episode with late or frozen observations
+_SOON = 2.0  # s
 _FROZEN = {"every second picture frozen": {"image_rate": 10.0}}
-CHANGES: dict[SimulatedTask, dict[str, dict[str, Any]]] = {
+_CHANGES: dict[TaskName, dict[str, dict[str, Any]]] = {
     "pick-place": {
         **_LIGHT,
         "1 other object, target named": {"distractors": 1},
@@ -57,11 +58,18 @@ CHANGES: dict[SimulatedTask, dict[str, dict[str, Any]]] = {
 
 
 @checked_dataclass
-class Config(DeployedOptions):
+class Config(TrialOptions):
     """Options of benchmark robustness."""
 
+    tasks: tuple[TaskName, ...] = get_args(SimulatedTask)
+    """Tasks; the maze is on test wires."""
+    as_deployed: bool = True
+    """Let the arm behave as deployed."""
     changes: tuple[str, ...] = ()
     """Changes to try, such as "light -15%"; default: all of the task, and none."""
+    hidden_verdict: bool = False
+    """Hide the simulator's verdict: a run ends when the policy says that it is done. Then the arm rests for
+    a second, and the simulator tells the outcome."""
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -75,11 +83,18 @@ def run(config: Config) -> dict[str, Any]:
     if not cases:
         known = sorted({name for task in config.tasks for name in _environments(config, task)})
         raise UserError(f"no such change; choose from: {', '.join(known)}")
-    return try_cases(config, cases)
+    found = try_cases(config, cases)
+    lines = [found["table"]]
+    for row in found["rows"] if config.hidden_verdict else ():
+        late = [t["late"] for t in row["trials"] if t["success"]]
+        soon = sum(seconds is not None and abs(seconds) <= _SOON for seconds in late)
+        lines.append(f"{row['what']}: {soon} of {len(late)} successes ended within {_SOON:g} s")
+    return {**found, "table": "\n".join(lines)}
 
 
-def _environments(config: Config, task: SimulatedTask) -> dict[str, TaskConfig]:
-    base = replace(deployed(task), as_deployed=config.as_deployed)
+def _environments(config: Config, task: TaskName) -> dict[str, TaskConfig]:
+    ends = not config.hidden_verdict
+    base = replace(deployed(task), as_deployed=config.as_deployed, ends_by_success=ends)
     late = {
         name: replace(
             base,
@@ -88,5 +103,5 @@ def _environments(config: Config, task: SimulatedTask) -> dict[str, TaskConfig]:
         )
         for name, change in (_DELAYED | _FROZEN).items()
     }
-    changed = {name: replace(base, **change) for name, change in CHANGES[task].items()}
+    changed = {name: replace(base, **change) for name, change in _CHANGES.get(task, {}).items()}
     return {UNCHANGED: base, **changed, **late}

@@ -4,12 +4,11 @@ import sys
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, replace
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 from benchmarks.options import CORES, BenchmarkOptions
-from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.policies.by_name import choose_policy
 from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy
 from touchgoal.policies.evaluation.evaluate import (
@@ -40,16 +39,6 @@ class TrialOptions(BenchmarkOptions):
     """Random seed of the first episode; each further one adds one."""
     workers: Count = CORES
     """Processes that simulate."""
-
-
-@checked_dataclass
-class DeployedOptions(TrialOptions):
-    """Options of a benchmark that tries a policy in several tasks, as deployed."""
-
-    tasks: tuple[SimulatedTask, ...] = get_args(SimulatedTask)
-    """Tasks; the maze is on test wires."""
-    as_deployed: bool = True
-    """Let the arm behave as deployed."""
 
 
 def deployed(task: TaskName) -> TaskConfig:
