@@ -22,7 +22,6 @@ from benchmarks.deployment.trials import (
     table_row,
 )
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
 from touchgoal.episodes.recording import EpisodeSpec
@@ -31,7 +30,7 @@ from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trial,
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.runtime.parallel.parallel_map import parallel_map
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.config import ENVS, TaskConfig, TaskName
+from touchgoal.sim_envs.config import TaskConfig, TaskName
 
 Change = Callable[[Observation, int], Observation]
 """Returns the tactile images that a policy sees at a tick, from those that are there."""
@@ -66,8 +65,7 @@ def run(config: Config) -> dict[str, Any]:
     """Return success and force by task and change of touch, with the trials."""
     lines, rows = [TABLE_HEAD], []
     for task in config.tasks:
-        wanted = deployed(task) if task in get_args(SimulatedTask) else ENVS[task]
-        make, env = prepare_policy(config.policy, wanted)
+        make, env = prepare_policy(config.policy, deployed(task))
         pairs = list(pairwise(trial_specs(env, config.episodes + 1, config.seed)))
         with parallel_map(partial(_audit, env, make), pairs, config.workers) as found:
             trials = list(track(found, f"{task}: audit", "episode", total=len(pairs)))

@@ -93,8 +93,8 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _environments(config: Config, task: TaskName) -> dict[str, TaskConfig]:
-    ends = not config.hidden_verdict
-    base = replace(deployed(task), as_deployed=config.as_deployed, ends_by_success=ends)
+    base = replace(deployed(task), ends_by_success=not config.hidden_verdict)
+    base = base if config.as_deployed else replace(base, as_deployed=False)
     late = {
         name: replace(
             base,

@@ -4,11 +4,12 @@ import sys
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from benchmarks.options import CORES, BenchmarkOptions
+from touchgoal.control.cell.config import SimulatedTask
 from touchgoal.policies.by_name import choose_policy
 from touchgoal.policies.checkpoint import EPISODE_OBJECT, SavedPolicy
 from touchgoal.policies.evaluation.evaluate import (
@@ -42,8 +43,8 @@ class TrialOptions(BenchmarkOptions):
 
 
 def deployed(task: TaskName) -> TaskConfig:
-    """Return a task as deployed: of the maze test wires, the hand up to 10 degrees askew."""
-    base = replace(ENVS[task], as_deployed=True)
+    """Return a task as deployed, if it can be: of the maze test wires, the hand up to 10 degrees askew."""
+    base = replace(ENVS[task], as_deployed=task in get_args(SimulatedTask))
     if isinstance(base, BeadMazeConfig):
         return replace(base, split="test", start_angle=10.0)
     return base
