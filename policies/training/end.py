@@ -14,7 +14,8 @@ _STEPS, _BATCH, _RATE, _DECAY, _NOISE = 1500, 512, 1e-3, 1e-2, 0.1
 _ROWS = 1024  # windows that are encoded at once
 _LASTING = 0.3  # s for which a probability must last; recordings stop soon after the end
 _EARLY = 1.0  # s before a recording's end at which it is not done
-_LEAST = 0.5  # smallest limit, and share of the successful recordings whose end must be noticed
+_LEAST_LIMIT = 0.5
+_LEAST_TOLD = 0.5  # share of the successful recordings whose end must be noticed
 
 
 def fit_end(
@@ -50,16 +51,15 @@ def _set_limit(
     end: EndOutput, policy: PolicyNetwork, validation: SequenceDataset
 ) -> tuple[int, int]:
     recorded, hz = validation.recorded, policy.config.control_hz
-    last, before = [], [_LEAST]
-    found = end(_conditions(policy, validation))
-    lengths = list(recorded.lengths)
+    last, before = [], [_LEAST_LIMIT]
+    found, lengths = end(_conditions(policy, validation)), list(recorded.lengths)
     for episode, done in zip(found.split(lengths), recorded.done.split(lengths), strict=True):
         lasting = episode.unfold(0, min(round(_LASTING * hz), len(episode)), 1).amin(1)
         before += lasting[: -round(_EARLY * hz) if done[-1] else None].tolist()
         last += [lasting.max().item()] * bool(done[-1])
     limit = max(before)
     told = sum(value > limit for value in last)
-    end.limit.fill_(limit if told >= max(1, _LEAST * len(last)) else torch.inf)
+    end.limit.fill_(limit if told >= max(1, _LEAST_TOLD * len(last)) else torch.inf)
     return told if end.limit.isfinite() else 0, len(last)
 
 
