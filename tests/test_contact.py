@@ -208,3 +208,15 @@ def test_touches(tmp_path: Path, truth: bool) -> None:
     again = collect_touches(episodes, 8, 3, seed=0)
     np.testing.assert_array_equal(again.frames, touches.frames)
     assert (collect_touches(episodes, 8, 3, seed=1).frames != touches.frames).any()
+
+
+def test_a_firm_grasp_in_the_first_frames_is_no_noise() -> None:
+    """It moves all dots; learnt as background, no depth of the whole run would be read."""
+    dots = {"sensor": "gelsight_mini_markers", "as_deployed": True, "split": "test"}
+    env = BeadMaze(BeadMazeConfig(cameras=()), **dots)
+    seen, _ = env.reset(seed=7_000_001)
+    detectors = {key: ContactDetector(Background(seen[key][None])) for key in ft.TACTILE}
+    for _ in range(14):
+        seen = env.step(np.zeros(8))[0]
+        touching = [detector.update(seen[key]) for key, detector in detectors.items()]
+    assert touching == [True, True]

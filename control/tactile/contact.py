@@ -21,6 +21,7 @@ _FEWEST_FRAMES = 3  # of these that differ
 _LEARNING_QUANTILE = 0.3
 _OVER_NOISE = 1.8  # multiple of the usual noise below which any contact ends
 _LEARNING_THRESHOLD = 5.0  # counts; the strongest compression noise measured had a strength of 2.5
+_MOST_NOISE = 10.0  # counts, four times that; a firm grasp changes all of a gel, as noise does
 # Strength of a change per its median over the image, above which it is no noise: Gaussian noise
 # reaches 6, presses of balls on a real Mini 16 to 25.
 _NOISE_PEAK = 8.0
@@ -33,8 +34,8 @@ class ContactDetector:
     Contact begins when `strength` (see `contact_strength`) exceeds the threshold, counts. It ends
     below half of it, so that it does not flicker, or below a tenth of the contact's peak, because
     the light drifts on during a long one. Without a threshold it is learned from the noise of the
-    first 10 frames, during which only a strong contact counts: 5 counts, and eight times the median
-    over the image, because noise is everywhere.
+    first 10 frames, during which only a strong contact counts: 5 counts, or eight times the median
+    over the image, because noise is everywhere; 10 are enough.
     """
 
     def __init__(self, background: Background, threshold: float | int | None = None) -> None:
@@ -53,7 +54,7 @@ class ContactDetector:
         change = local_change(remove_gain(frame, rest), rest)
         self.strength = float(change.max())
         if self._untouched is not None:
-            noise = _NOISE_PEAK * float(np.median(change))
+            noise = min(_NOISE_PEAK * float(np.median(change)), _MOST_NOISE)
             self.threshold = max(_LEARNING_THRESHOLD, noise)
         self._peak = max(self._peak, self.strength) if self.touching else self.strength
         least = max(self.threshold / 2, _OVER_NOISE * self._noise)

@@ -179,8 +179,7 @@ def run_trial(
                 late = since_first - OUTCOME_SECONDS
         except RefusedError:
             rows, failed = [*rows, [last[key] for key in keys]], [REFUSED]
-        columns = zip(*rows, strict=True)
-        wrench, pads, progress, actions, _ = map(np.stack, columns)
+        wrench, pads, progress, actions, _ = map(np.stack, zip(*rows, strict=True))
         force = np.linalg.norm(wrench[:, :3], axis=1)
         goal = env.goal if isinstance(env, PickPlace) else None
         away = None if goal is None else np.linalg.norm(last[ft.TRUTH_OBJECT_POSE][:2] - goal)
