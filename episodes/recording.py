@@ -18,7 +18,7 @@ from touchgoal.control.interfaces import Actor
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import Description, EncodedEpisode, encode
 from touchgoal.episodes.outcomes.verify import outcome_reached
-from touchgoal.episodes.schema import Episode, MetaValue
+from touchgoal.episodes.schema import CORRECTED, Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.parallel.parallel_map import Workers, parallel_map
@@ -42,8 +42,6 @@ class EpisodeSpec:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-CORRECTED = "corrected"
-"""Outcome of an episode in which a policy acted while an expert's actions were recorded."""
 Roles = Callable[[Any, EpisodeSpec], tuple[Actor, Actor]]
 """Return the actor, and the expert whose actions are recorded, for an environment after its reset; one
 object twice if the expert itself acts."""

@@ -10,6 +10,8 @@ from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
 
 MetaValue = str | int | float | bool | list[str]
+CORRECTED = "corrected"
+"""Outcome of an episode in which a policy acted while an expert's actions were recorded."""
 
 INDEX_DTYPES = {  # which LeRobot adds to every frame, each a scalar of feature shape [1]
     "timestamp": "float32",

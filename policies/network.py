@@ -152,11 +152,11 @@ class PolicyNetwork(nn.Module):
         self.novelty = NoveltyDetector(config.touch_dim) if watches else None
         condition_dim += kp.KEY_POSE_DIM if self.key_pose else 0
         self.condition_dim = condition_dim
-        self.end = EndOutput(condition_dim) if config.says_end else None
         if isinstance(config.head, DiffusionConfig):
             self.head = Diffusion(config.head, ticks, ACTION_DIM, condition_dim)
         else:
             self.head = Regression(config.head, ticks, ACTION_DIM, condition_dim)
+        self.end = EndOutput(condition_dim) if config.says_end else None  # drawn last
 
     def fit_normalizers(
         self,

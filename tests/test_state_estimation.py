@@ -12,7 +12,8 @@ from toy_policies import TOY, torch_rng, toy_dataset, toy_policy
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.episodes.recording import CORRECTED, EpisodeSpec, record_episode
+from touchgoal.episodes.recording import EpisodeSpec, record_episode
+from touchgoal.episodes.schema import CORRECTED
 from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig

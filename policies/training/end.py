@@ -15,7 +15,7 @@ _ROWS = 1024  # windows that are encoded at once
 _LASTING = 0.3  # s for which a probability must last; recordings stop soon after the end
 _EARLY = 1.0  # s before a recording's end at which it is not done
 _LEAST_LIMIT = 0.5
-_LEAST_TOLD = 0.5  # share of the successful recordings whose end must be noticed
+_LEAST_TOLD, _FEWEST = 0.5, 5  # share of the ends that must be noticed, of so many at least
 
 
 def fit_end(
@@ -24,7 +24,7 @@ def fit_end(
     """Fit the end output to windows; return how many of the successful validation episodes it ends.
 
     The second number is that of these episodes. The limit is the least that no validation episode exceeds a
-    second before its end; infinite if fewer than half exceed it by then.
+    second before its end; infinite if fewer than half of the ends, or of 5 episodes, exceed it.
     """
     assert policy.end is not None, "the policy has no end output"
     condition, done = _conditions(policy, windows), windows.recorded.done.float()
@@ -59,7 +59,7 @@ def _set_limit(
         last += [lasting.max().item()] * bool(done[-1])
     limit = max(before)
     told = sum(value > limit for value in last)
-    end.limit.fill_(limit if told >= max(1, _LEAST_TOLD * len(last)) else torch.inf)
+    end.limit.fill_(limit if told >= _LEAST_TOLD * max(len(last), _FEWEST) else torch.inf)
     return told if end.limit.isfinite() else 0, len(last)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.batch_noise import BatchNoise
-from touchgoal.episodes.recording import CORRECTED
+from touchgoal.episodes.schema import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.policies.heads.end import END_SECONDS

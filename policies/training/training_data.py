@@ -9,7 +9,7 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.episodes.faults import leave_out_faulty
 from touchgoal.episodes.outcomes.judged import read_judged
-from touchgoal.episodes.recording import CORRECTED
+from touchgoal.episodes.schema import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.training.action_meaning import ActionMeaning, joint_changes
 from touchgoal.runtime.errors import UserError
