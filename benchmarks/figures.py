@@ -44,10 +44,10 @@ def mended(metrics: Metrics) -> str:
     rows = []
     for row in metrics["rows"]:
         failures = Counter(trial["failure"] for trial in row["trials"])
-        told = [
+        counts = [
             f", {failures[how]} {how}" for how in ("gave up", "falsely done") if how in failures
         ]
-        rows.append(f"{row['what']} {_rate(row['trials'])}{''.join(told)}")
+        rows.append(f"{row['what']} {_rate(row['trials'])}{''.join(counts)}")
     return "; ".join(rows)
 
 

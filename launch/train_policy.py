@@ -228,9 +228,8 @@ def main(config: Config) -> None:
     if env is not None and trials:
         scores = select(out, parts, lambda d: score(d, env, trials, workers))
         write_json(out / "metrics.json", {"snapshots": scores})
-    told, of = POLICY_FORMAT.provenance(out / POLICY)["ended"]
-    how = f"ended {told} of {of} validation episodes by itself" if told else "does not tell the end"
-    print(f"policy: {out / POLICY}; it {how}")
+    ended, of = POLICY_FORMAT.provenance(out / POLICY)["ended"]
+    print(f"policy: {out / POLICY}; it notices {ended} of {of} ends in validation")
     if simulated:
         print(f"next: touchgoal run-policy --task {task} --policy {out / POLICY}")
     else:

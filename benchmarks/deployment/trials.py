@@ -24,7 +24,7 @@ from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import ENVS, BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
 UNCHANGED = "unchanged"  # row of a table
-_TOLD = REFUSED, GAVE_UP, FALSELY_DONE  # failures that a row counts
+_COUNTED = REFUSED, GAVE_UP, FALSELY_DONE  # failures that a row counts
 TABLE_HEAD = f"{'':<46}{'success [95 % Wilson]':<24}{'peak force N, mean':>19}{'sd':>6}{'max':>6}"
 
 
@@ -82,5 +82,5 @@ def table_row(what: str, result: Evaluation) -> str:
     peak = [trial.peak_force for trial in result.trials]
     force = f"{np.mean(peak):>19.1f}{np.std(peak):>6.1f}{max(peak):>6.1f}"
     failures = Counter(trial.failure for trial in result.trials)
-    told = [f"  {failures[how]} {how}" for how in _TOLD if how in failures]
-    return "".join([f"{what:<46}{result!s:<24}{force}", *told])
+    counts = [f"  {failures[how]} {how}" for how in _COUNTED if how in failures]
+    return "".join([f"{what:<46}{result!s:<24}{force}", *counts])

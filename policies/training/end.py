@@ -15,7 +15,7 @@ _ROWS = 1024  # windows that are encoded at once
 _LASTING = 0.3  # s for which a probability must last; recordings stop soon after the end
 _EARLY = 1.0  # s before a recording's end at which it is not done
 _LEAST_LIMIT = 0.5
-_LEAST_TOLD, _FEWEST = 0.5, 5  # share of the ends that must be noticed, of so many at least
+_LEAST_SHARE, _FEWEST = 0.5, 5  # share of the ends that must be noticed, of so many at least
 
 
 def fit_end(
@@ -42,9 +42,9 @@ def fit_end(
         optimiser.zero_grad()
         F.binary_cross_entropy_with_logits(found, done[rows]).backward()
         optimiser.step()
-    told = _set_limit(end.requires_grad_(False), policy, validation)
+    ended = _set_limit(end.requires_grad_(False), policy, validation)
     policy.end.load_state_dict(end.state_dict())
-    return told
+    return ended
 
 
 def _set_limit(
@@ -58,9 +58,9 @@ def _set_limit(
         before += lasting[: -round(_EARLY * hz) if done[-1] else None].tolist()
         last += [lasting.max().item()] * bool(done[-1])
     limit = max(before)
-    told = sum(value > limit for value in last)
-    end.limit.fill_(limit if told >= _LEAST_TOLD * max(len(last), _FEWEST) else torch.inf)
-    return told if end.limit.isfinite() else 0, len(last)
+    ended = sum(value > limit for value in last)
+    end.limit.fill_(limit if ended >= _LEAST_SHARE * max(len(last), _FEWEST) else torch.inf)
+    return ended if end.limit.isfinite() else 0, len(last)
 
 
 @torch.no_grad()

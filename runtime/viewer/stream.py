@@ -80,12 +80,13 @@ class RerunStream:
     def _work(self) -> None:
         laid_out = False
         while (tick := self._queue.get()) is not None:
+            if self._error is not None:
+                continue
             try:
                 if not laid_out:
                     self._recording.send_blueprint(lay_out(*tick[2:]))
                     laid_out = True
-                if self._error is None:
-                    self._write(*tick)
+                self._write(*tick)
             except Exception as error:  # `close` reports it: no arm stops for a viewer
                 self._error = error
 
