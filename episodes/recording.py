@@ -111,11 +111,13 @@ def run(
     observation: Observation,
     info: dict[str, Any],
     expert: Actor | None = None,
+    outcome_seconds: float = OUTCOME_SECONDS,
 ) -> Iterator[dict[str, np.ndarray]]:
     """Act until the episode ends, then rest as the config says; yield each tick with action and truth.
 
     The environment was just reset. An expert's actions, if given, are recorded in place of the
-    actor's. An actor that is done, without an expert, ends the episode; a second of rest shows the outcome.
+    actor's. The actor, or the expert, ends the episode when it is done; `outcome_seconds` of rest then show
+    the outcome.
     """
     rest = env.config.rest
     while True:
@@ -125,8 +127,8 @@ def run(
         observation, _, terminated, truncated, info = env.step(action)
         if terminated or truncated or actor.given_up:
             break
-        if actor.done and expert is None:
-            rest = max(rest, OUTCOME_SECONDS)
+        if (expert or actor).done:
+            rest = max(rest, outcome_seconds)
             break
     still = np.append(np.zeros(env.n_joints), recorded[-1]).astype(np.float32)
     yield {**observation, ft.ACTION: still, **info}
@@ -142,8 +144,8 @@ def record_episode(
     observation, info = env.reset(seed=spec.seed, options=spec.options)
     actor, expert = roles(env, spec)
     if expert is actor:
-        return to_episode(env, list(run(env, actor, observation, info)), spec)
-    ticks = list(run(env, actor, observation, info, expert))
+        return to_episode(env, list(run(env, actor, observation, info, None, 0.0)), spec)
+    ticks = list(run(env, actor, observation, info, expert, 0.0))
     episode = to_episode(env, ticks, spec)
     return replace(episode, meta={**episode.meta, "outcome": CORRECTED})
 

@@ -3,6 +3,7 @@
 import os
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
@@ -90,9 +91,9 @@ def main(config: Config) -> None:
     kept = f"finished episodes are in {root}; the same command with --out {out} continues"
     try:
         with on_interruption(lambda: kept):
-            metas = recording.collect(
-                root, config.env, missing, config.ray or config.workers, roles, most
-            )
+            # the maze's bead is led on to where the end is felt; its expert says when that is
+            env = replace(config.env, ends_by_success=config.task != "bead-maze")
+            metas = recording.collect(root, env, missing, config.ray or config.workers, roles, most)
     except recording.NoSuccessError as error:
         print(f"{error}; look at one: touchgoal run-policy --task {config.task}", file=sys.stderr)
         sys.exit(NO_SUCCESS)

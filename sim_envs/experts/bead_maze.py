@@ -13,21 +13,26 @@ _FASTEST = 0.02  # m/s (or, times _LEVER, rad/s): fastest return from a large de
 _LEAD = 0.006  # m that the commanded bead may be ahead of the real one, which may be jammed
 _SLOW = 0.004  # m (or, times _LEVER, rad) of deviation at which motion along the wire stops
 _LEVER = 0.02  # m by which a turn counts as a displacement: the size of the bead
+_AT_POST = 0.388  # m of arc; the post stops the bead 1 to 4 mm behind
+_PRESS = 0.0015  # m that the commanded bead is ahead there: about 7 N
+_PRESSED_SECONDS = 0.7  # at the post, until the end is reached
 
 
 class BeadMazeExpert(Actor):
-    """Leads the bead along the wire, the hand turned with the wire.
+    """Leads the bead along the wire to its post, the hand turned with the wire.
 
     It acts on the commanded pose, so that the arm's compliance does not add up; a bead that slipped
     in the hand is led from where it is.
     """
 
     def __init__(self, env: BeadMaze) -> None:
-        self._env = env
+        self._env, self._pressed = env, 0
 
     def act(self, observation: Observation) -> np.ndarray:
         """Return the action for the next tick; the observation is not used."""
         env = self._env
+        self._pressed += (at_post := env.arc_length > _AT_POST)
+        self.done = self._pressed > _PRESSED_SECONDS * env.config.control_hz
         if env.grasping:
             return np.zeros(env.n_joints + 1)
         tick, grip = 1 / env.config.control_hz, self._grip()
@@ -40,7 +45,9 @@ class BeadMazeExpert(Actor):
         deviation = max(float(np.linalg.norm(off)), _LEVER * float(np.linalg.norm(turned)))
         ahead = _SPEED * tick * max(0.0, 1 - deviation / _SLOW)
         left = max(np.exp(-_RETURN * tick), 1 - _FASTEST * tick / max(deviation, 1e-9))
-        point, tangent = env.wire.at(min(s + ahead, env.arc_length + _LEAD))
+        point, tangent = env.wire.at(
+            min(s + ahead, env.arc_length + (_PRESS if at_post else _LEAD))
+        )
         R = fingers_across(tangent) @ rotation_matrix(left * turned)
         target = point + left * off - R @ grip
         joints = env.kinematics.solve_ik_near(target, R, env.command).q
