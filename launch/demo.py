@@ -69,7 +69,7 @@ def main(config: Config) -> None:
     embedded = reward.embedder.embed_chunks([held], hz, str(held.meta["object"]))
     curves = reward.curves(embedded)
     judged = Reward.of_judge(SHIPPED_JUDGE).prepare(inputs).judge_episode(embedded)
-    write_report(curves, out, "curves", reward.provenance())
+    write_report(curves, out, "curves")
     shown = {name: curves.costs[name] for name in FILMED}
     film = out / "episode.mp4"
     write_film(film, images, episode, hz, shown, "distance to goal", curve_colors(FILMED))

@@ -104,7 +104,7 @@ class Measurement:
             self.skipped.append(Skipped(name, str(error)))
             return
         about = ", ".join(str(meta[k]) for k in ("object", "outcome") if meta.get(k))
-        write_report(curves, self._out, name, reward.provenance(), name in self._plotted, about)
+        write_report(curves, self._out, name, name in self._plotted, about)
         for stale in path.parent.glob(f"{name}.*.npz"):
             stale.unlink()
         record_of(curves, trajectory, thumbnails).save(path)

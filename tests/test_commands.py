@@ -66,17 +66,16 @@ def test_collected_episodes_are_sound(episodes: Path, capsys: pytest.CaptureFixt
 
 
 def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
-    out = tmp_path / "curves"
+    out, bare = tmp_path / "curves", tmp_path / "plain"
     goals = "--goal", f"episode:{episodes}#1", "--goal", "text:a hard smooth round object"
     run("reward-curves", episodes, *goals, "--index", 0, "--out", out)
-    run("reward-curves", episodes, *goals, "--index", 0, "--plain", "--out", tmp_path / "plain")
+    run("reward-curves", episodes, *goals, "--index", 0, "--plain", "--out", bare)
     image = cv2.imread(str(out / "episode_000.png"))
     assert image is not None and image.shape == (1000, 1200, 3)
-    report, plain = (
-        json.loads((folder / "episode_000.json").read_text())["metrics"]
-        for folder in (out, tmp_path / "plain")
-    )
+    told, plain = (json.loads((f / "metrics.json").read_text())[0] for f in (out, bare))
     parts = "front wrist wrist_map object force centre held slip words wrench value fused"
+    assert told["source"] == "episodes#0" and told["contact_source"] == "truth"
+    report, plain = told["measured"], plain["measured"]
     assert set(report) == set(parts.split())
     assert set(plain) == {"image", "tactile", "text", "image+tactile", "image+text"}
     rows = (out / "episode_000.csv").read_text().splitlines()
@@ -84,7 +83,6 @@ def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
     # A part is at 0.5 within 1.5 spreads of successes.
     for touch, near in ((report["object"], 0.5), (plain["tactile"], 0.3)):
         assert touch["end"] < near < 0.9 < touch["start"]
-    assert json.loads((out / "metrics.json").read_text())[0]["source"] == "episodes#0"
 
 
 @pytest.mark.slow

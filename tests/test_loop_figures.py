@@ -209,9 +209,8 @@ def test_a_clock_that_stands_still_is_watched_for_ten_looks_at_a_second_each(
 ) -> None:
     cell, wall = FakeCell(), iter(range(99))
     loop = ControlLoop(cell.connection(), SAFETY, True, **QUIET)
-    speeds = (
-        replace(cell.arm.reading, velocity=(n < value) * E[0], time=1.0 * n) for n in range(99)
-    )
+    still = cell.arm.reading
+    speeds = (replace(still, velocity=(n < value) * E[0], time=1.0 * n) for n in range(99))
     monkeypatch.setattr(cell.arm, "read", lambda: next(speeds))
     monkeypatch.setattr(cell.clock, "wait", lambda _: None)
     monkeypatch.setattr(control_loop, "time", SimpleNamespace(monotonic=lambda: next(wall)))
@@ -250,9 +249,8 @@ def test_what_preflight_lets_pass(
     config = read_cell_file(write_cell_file(tmp_path, SIM + tips))
     monkeypatch.setattr(preflight, "require_readable", lambda *_: None)
     for value, refused in ((inside, False), (outside, True)):
-        given = {"rate": 30.0, "late": 0.0, "counts": 0.0, "disk": 1e12, "settles": 0.0} | {
-            what: value
-        }
+        given = {"rate": 30.0, "late": 0.0, "counts": 0.0, "disk": 1e12, "settles": 0.0}
+        given[what] = value
         cell = with_arm(late=given["late"])
         if what == "tcp":
             there, _ = KINEMATICS.forward(HOME)

@@ -184,6 +184,12 @@ def test_mistakes_are_found_before_any_encoder_is_loaded(
     assert not (run_folder / "out").exists()
 
 
+def costs_of(name: str) -> dict[str, list[float]]:
+    rows = np.genfromtxt(f"{name}.csv", delimiter=",", names=True, deletechars="")
+    costs = [column for column in rows.dtype.names or () if column.startswith("cost_")]
+    return {column.removeprefix("cost_"): rows[column].tolist() for column in costs}
+
+
 def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
     run_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -193,10 +199,10 @@ def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
     for source in ("episodes", "0.mp4"):
         main(["reward-curves", source, "--out", f"raw-{source}"])
         assert "raw cosine distances, for" in capsys.readouterr().out
-    raw = json.loads(Path("raw-0.mp4/0.json").read_text())
-    assert raw["unit"] == "cosine distance to goal" and min(raw["cost"]["values"]["image"]) >= 0
-    of_episodes = json.loads(Path("raw-episodes/episode_000.json").read_text())
-    assert set(of_episodes["metrics"]) == {"image", "tactile"}
+    [raw] = json.loads(Path("raw-0.mp4/metrics.json").read_text())
+    assert raw["unit"] == "cosine distance to goal" and min(costs_of("raw-0.mp4/0")["image"]) >= 0
+    of_episodes = json.loads(Path("raw-episodes/metrics.json").read_text())[0]
+    assert set(of_episodes["measured"]) == {"image", "tactile"}
 
     main(["fit-normalizer", "episodes", "--modalities", "tactile", "--out", "touch"])
     fitted = DistanceNormalizer.load(Path("touch/normalizer.json"))
@@ -209,9 +215,9 @@ def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
 
     main(["fit-normalizer", "0.mp4", "1.mp4", "--out", "videos"])
     main(["reward-curves", "0.mp4", "--normalizer", "videos/normalizer.json", "--out", "scaled"])
-    scaled = json.loads(Path("scaled/0.json").read_text())
+    [scaled] = json.loads(Path("scaled/metrics.json").read_text())
     assert scaled["unit"] == "distance to goal (normalised)"
-    assert scaled["metrics"]["fused"]["start"] == pytest.approx(1, abs=0.2)
+    assert scaled["measured"]["fused"]["start"] == pytest.approx(1, abs=0.2)
 
 
 def test_costs_are_those_on_record(
@@ -231,10 +237,7 @@ def test_costs_are_those_on_record(
     assert "the scene here is recorded, not simulated" in capsys.readouterr().out
     main(["reward-curves", "set", *goals, "--out", "parts"])
     main(["reward-curves", "set", *goals, "--plain", "--out", "plain"])
-    raw, parts, plain = (
-        json.loads(Path(out, "episode_000.json").read_text())["cost"]["values"]
-        for out in ("raw", "parts", "plain")
-    )
+    raw, parts, plain = (costs_of(f"{out}/episode_000") for out in ("raw", "parts", "plain"))
     curves = Reward(("last", "a hard ball"), normalizer="encoder")(images=IMAGES, tactile=TOUCH)
     assert curves.unit == "distance to goal (normalised)" and "\n" not in repr(curves)
     pairs = (raw, STORED["raw"]), (parts | plain, STORED["normalised"]), (curves.costs, parts)

@@ -1,16 +1,14 @@
-"""Report of one trajectory (a plot, a CSV and a JSON), and of all that were measured."""
+"""Report of one trajectory (a plot and a CSV), and of all that were measured."""
 
 import io
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from touchgoal.rewards.curves import GAMMA, Curves
+from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.report.frame_table import PROGRESS, write_frames, write_progress
 from touchgoal.rewards.report.page import write_pages
 from touchgoal.rewards.report.plot import plot
@@ -19,23 +17,20 @@ from touchgoal.rewards.report.tables import MOST_CURVES, ends_table, metrics_tab
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.json_file import write_json
 
+_LISTED = (
+    "source object outcome goal own_goal unit contact contact_source frames fps measured".split()
+)
+"""Facts of each trajectory in metrics.json."""
+
 
 def write_report(
-    curves: Curves,
-    folder: Path,
-    name: str,
-    provenance: Mapping[str, Any],
-    with_plot: bool = True,
-    about: str = "",
+    curves: Curves, folder: Path, name: str, with_plot: bool = True, about: str = ""
 ) -> dict[str, Path]:
-    """Write NAME.csv, NAME.json and, on request, NAME.png, each atomically; return the paths by kind.
+    """Write NAME.csv and, on request, NAME.png, each atomically; return the paths by kind.
 
-    The plot's title ends with `about`. The JSON also holds what the curves were made with (encoder, towers, command).
+    The plot's title ends with `about`.
     """
-    contents = {
-        "csv": curves_csv(curves).encode(),
-        "json": (json.dumps(report_json(curves, provenance), indent=2) + "\n").encode(),
-    }
+    contents = {"csv": curves_csv(curves).encode()}
     if with_plot:
         png = io.BytesIO()
         FigureCanvasAgg(plot(curves, about=about)).print_png(png, metadata={"Software": None})
@@ -52,8 +47,7 @@ def report_all(records: Sequence[Path], out: Path, provenance: Mapping[str, Any]
     Return why the reward is not to be trained on, "" if nothing speaks against it.
     """
     facts = [Record.load(path).facts for path in records]
-    about = [{"source": f.source, "object": f.object, "outcome": f.outcome} for f in facts]
-    write_json(out / "metrics.json", [a | f.measured for a, f in zip(about, facts, strict=True)])
+    write_json(out / "metrics.json", [{key: getattr(f, key) for key in _LISTED} for f in facts])
     write_frames(records, facts, out, provenance)
     if facts[0].normalised:
         write_progress(records, out)
@@ -73,37 +67,11 @@ def report_all(records: Sequence[Path], out: Path, provenance: Mapping[str, Any]
     )
 
 
-def report_json(curves: Curves, provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Return metrics, costs and rewards of every curve, and how they were made, ready for JSON."""
-    return {
-        "source": curves.source,
-        "goal": dict(curves.goal),
-        "frames": len(curves),
-        "fps": curves.fps,
-        "contact": {"frame": curves.contact.frame, "label_source": curves.contact.label_source},
-        "unit": curves.unit,
-        "metrics": {name: asdict(m) for name, m in curves.metrics().items()},
-        "cost": {"values": _rounded(curves.costs)},
-        "state_reward": {"definition": "-cost", "values": _rounded(curves.rewards)},
-        "potential_reward": {
-            "definition": "g Phi(frame) - Phi(frame before), g = gamma^(1 / fps), Phi = -cost",
-            "gamma": GAMMA,
-            "values": _rounded(curves.potential_rewards()),
-        },
-        "goal_is_own_frame": sorted(curves.same_episode),
-        "provenance": dict(provenance),
-    }
-
-
-def _rounded(curves: Mapping[str, np.ndarray]) -> dict[str, list[float]]:
-    return {name: np.round(values, 6).tolist() for name, values in curves.items()}
-
-
 def curves_csv(curves: Curves) -> str:
     """Return a CSV with a row per frame.
 
     Columns: frame, time (s); for every curve `cost_`, `reward_` (-cost) and `potential_reward_`
-    (see `report_json`); `cosine_distance_` of every single modality.
+    (see `potential_reward`); `cosine_distance_` of every single modality.
     """
     frames = np.arange(len(curves))
     columns = {"frame": frames, "time_s": frames / curves.fps, **columns_of(curves)}
