@@ -159,6 +159,8 @@ class LearnedPolicy(Planner):
             actions = self._network.plan(batch, *rest)[0].numpy()
             done = self._network.is_done(batch, self._key_pose)
             self._done_plans = self._done_plans + 1 if done else 0
+            if done and self._network.end is not None and self._network.end.stands:
+                actions[:, :-1] = 0.0
             self.done = self._done_plans * self.execution_horizon >= DONE_SECONDS * self.control_hz
             # The last action of a plan comes a tick and `execution_horizon` ticks after its
             # observation. The whole motion is done where no age is known.

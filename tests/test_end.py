@@ -12,16 +12,18 @@ from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.evaluation.evaluate import FALSELY_DONE
 from touchgoal.policies.network import PolicyNetwork
 from touchgoal.policies.training.end import fit_end
+from touchgoal.policies.training.sequence_dataset import SequenceDataset
 from touchgoal.sim_envs.config import PickPlaceConfig
 
 CONFIG = replace(TOY, touch_dim=0, touch="", says_end=True, execution_horizon=2)
 LIFTED = 0.5  # rad of the second joint once the task is done
 
 
-def _fitted(lifted: float) -> tuple[PolicyNetwork, tuple[int, int]]:
+def _fitted(lifted: float, goes_on: bool = False) -> tuple[PolicyNetwork, tuple[int, int]]:
     train, validation = (toy_dataset(CONFIG, (60,) * 8, seed) for seed in (0, 1))
     for windows in (train, validation):
         windows.recorded.state[windows.recorded.done, 1] += lifted
+        windows.recorded.succeeded[:] = windows.recorded.done & goes_on
     policy = toy_policy(CONFIG, train).eval().requires_grad_(False)
     return policy, fit_end(policy, train, validation, seed=0)
 
@@ -42,8 +44,19 @@ def test_a_policy_is_done_once_it_has_looked_so_for_a_while() -> None:
     actor.reset()
     assert not any(said(0.0, 20) + said(LIFTED, 12) + said(0.0, 6))  # 0.6 s are too short
     assert said(LIFTED, 24)[-4:] == [True] * 4
+    moved = actor.act(dict(tick))[:7].any()
+    actor = LearnedPolicy(_fitted(LIFTED, goes_on=True)[0], None)
+    assert moved and said(LIFTED, 24)[-1] and not actor.act(dict(tick))[:7].any()
     actor.reset()
     assert not actor.done
+
+
+def test_actions_after_success_are_not_taught() -> None:
+    recorded = toy_dataset(CONFIG, (60,)).recorded
+    recorded.succeeded[40:] = True
+    padded = SequenceDataset(recorded, CONFIG).action_is_pad
+    assert [padded[t].int().argmax().item() for t in (33, 36, 40)] == [7, 4, 0]
+    assert not padded[:33].any() and padded[40:].all()
 
 
 def test_ends_that_look_like_what_comes_before_are_not_told() -> None:

@@ -97,9 +97,8 @@ def test_benchmark_shaping(tmp_path: Path) -> None:
     run_benchmark("shaping", *sizes.split(), "--out", tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert [len(curve) for curves in metrics["curves"].values() for curve in curves] == [2, 2]
-    sparse, shaped = (
-        shaping.training_env(shaping.Config(), tmp_path, arm) for arm in ("sparse", "shaped")
-    )
+    given = shaping.Config(), tmp_path
+    sparse, shaped = (shaping.training_env(*given, arm) for arm in ("sparse", "shaped"))
     for env, least, most in ((sparse, 1.0, 1.0), (shaped, 1.3, 2.2)):
         env.reset(seed=0)
         first = getattr(env, "_cost", 0.0)

@@ -263,9 +263,8 @@ def test_what_preflight_lets_pass(
         cell.cameras[ft.FRONT] = Paced(cell.clock, GEL, given["rate"])
         strength = np.array([given["counts"]])
         monkeypatch.setattr(preflight, "contact_strength", lambda *_, found=strength: found)
-        monkeypatch.setattr(
-            shutil, "disk_usage", lambda _, n=given["disk"]: SimpleNamespace(free=n)
-        )
+        disk = SimpleNamespace(free=given["disk"])
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, disk=disk: disk)
         lines = preflight.preflight(config, cell.connection(), SAFETY, tmp_path, lambda: 0)
         remedies = "; ".join(line.remedy for line in lines if not line.ok)
         assert (says in remedies) == refused == bool(remedies)
@@ -275,13 +274,8 @@ def deployed(cell: FakeCell, folder: Path, off: float = 0.0, **parts: object) ->
     """A run that begins with a move to a start pose `off` (rad), and whose plan is over at once."""
     start = (HOME + off * E[0]).tolist()
     file = write_cell_file(folder, SIM.replace("seed = 3", f"start = {start}"))
-    connection, plan = (
-        replace(cell.connection(), **parts),
-        lambda loop: ScriptedActor([], loop.commanded, 20),
-    )
-    return session.Session(
-        read_cell_file(file), connection, SAFETY, KeptTicks(), True, plan, **QUIET
-    )
+    given = read_cell_file(file), replace(cell.connection(), **parts), SAFETY, KeptTicks(), True
+    return session.Session(*given, lambda loop: ScriptedActor([], loop.commanded, 20), **QUIET)
 
 
 @sides((0.099, 0.101))

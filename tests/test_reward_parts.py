@@ -110,9 +110,8 @@ def test_a_failure_of_each_part_raises_that_part(
         embedded(9, slip=5e-3),
         embedded(9, pressed=30.0),
     )
-    good, hard, early, slid, pressed = (
-        compute_curves(end, goal, normalizer, value).parts for end in ends
-    )
+    parts = [compute_curves(end, goal, normalizer, value).parts for end in ends]
+    good, hard, early, slid, pressed = parts
     assert {name: cost[-1] < 0.5 for name, cost in good.items()} == dict.fromkeys(good, True)
     for failure, name in ((hard, "force"), (slid, "slip"), (pressed, "wrench")):
         assert failure[name][-1] > good[name][-1] + 0.4

@@ -238,9 +238,8 @@ def test_rewards_by_hand() -> None:
 def test_a_cost_nearer_than_the_usual_end_is_below_zero() -> None:
     raw = {"image": np.array([1e-16 - 2e-16, 2.0]), "tactile": np.array([0.1, 0.3])}
     near = {"image": np.array([-0.4, 1.0]), "tactile": np.array([1.0, -0.2])}
-    plain, normalised = (
-        Curves("a", {}, 20.0, Contact(None, "no touch"), raw, costs) for costs in ({}, near)
-    )
+    about = "a", {}, 20.0, Contact(None, "no touch"), raw
+    plain, normalised = (Curves(*about, costs) for costs in ({}, near))
     assert plain.costs["image"].min() == 0  # what rounding left below
     assert normalised.costs["image"] == pytest.approx([-0.4, 1.0])
     assert normalised.costs["image+tactile"] == pytest.approx([0.3, 0.4])

@@ -260,9 +260,8 @@ def test_five_answers_missed_in_a_row_lose_the_robotiq(line: tuple[int, str]) ->
 def test_a_load_cell_whose_controller_restarts_is_heard_again_and_one_old_line_is_not() -> None:
     cell = SerialLoadCell.__new__(SerialLoadCell)
     cell.clock, cell._last, cell._behind = -np.inf, -np.inf, 0
-    taken = [
-        cell._clock_advances(Sample(0.0, float(t))) for t in [*range(100, 120), 50, 120, 121, 121]
-    ]
+    times = map(float, [*range(100, 120), 50, 120, 121, 121])
+    taken = [cell._clock_advances(Sample(0.0, time)) for time in times]
     assert taken == [True] * 20 + [False, True, True, False]
     again = [cell._clock_advances(Sample(0.0, float(t))) for t in range(30)]
     assert again == [False] * 10 + [True] * 20

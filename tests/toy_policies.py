@@ -35,7 +35,8 @@ def toy_dataset(
     actions = 0.01 * torch.randn(n, 8, generator=generator)
     actions[:, 7] = 0.0  # a gripper that stays, as in the bead maze
     done = torch.cat([torch.arange(length) >= length - 10 for length in lengths])
-    return SequenceDataset(Recordings(touch, state, actions, lengths, done), config)
+    recorded = Recordings(touch, state, actions, lengths, done, torch.zeros(n).bool())
+    return SequenceDataset(recorded, config)
 
 
 def toy_policy(config: PolicyConfig, windows: SequenceDataset, seed: int = 0) -> PolicyNetwork:

@@ -23,6 +23,8 @@ class EndOutput(nn.Module):
         super().__init__()
         self.mean, self.scale = nn.Buffer(torch.zeros(inputs)), nn.Buffer(torch.ones(inputs))
         self.limit = nn.Buffer(torch.tensor(torch.inf))
+        # whether the recordings go on after success: no motion is taught there, so the arm stands still
+        self.stands = nn.Buffer(torch.tensor(False))
         self.network = readout(inputs, _WIDTH, 1).requires_grad_(False)
 
     def scaled(self, condition: Float[Tensor, "b c"]) -> Float[Tensor, "b c"]:

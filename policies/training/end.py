@@ -42,6 +42,7 @@ def fit_end(
         optimiser.zero_grad()
         F.binary_cross_entropy_with_logits(found, done[rows]).backward()
         optimiser.step()
+    end.stands.fill_((windows.recorded.succeeded & windows.recorded.done).sum() > done.sum() / 2)
     ended = _set_limit(end.requires_grad_(False), policy, validation)
     policy.end.load_state_dict(end.state_dict())
     return ended

@@ -36,6 +36,7 @@ class Recordings:
     actions: Float32[Tensor, "n 8"]  # `features.ACTION`
     lengths: tuple[int, ...]  # ticks of each episode
     done: Bool[Tensor, " n"]  # whether the task is done: the end of a successful episode
+    succeeded: Bool[Tensor, " n"]  # whether there is or was success, as a simulator knows
     images: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
     maps: Float16[Tensor, "n k c y x"] | None = None  # camera feature maps, see `ImageEmbedder`
     key_pose: Float32[Tensor, "n 3 8"] | None = None  # the last and the next two, beside `maps`
@@ -61,7 +62,8 @@ def load_recordings(
     images = ImageEmbedder(config.images) if config.images else None
     maps = embed_episodes(episodes, chosen, images, workers) if images else []
     keys = [*config.proprioception, ft.STATE, ft.ACTION]
-    touch, state, actions, differences, tcp = [], [], [], [], []
+    keys += [ft.TRUTH_SUCCESS] * (ft.TRUTH_SUCCESS in episodes.features)
+    touch, state, actions, succeeded, differences, tcp = [], [], [], [], [], []
     for n, i in enumerate(track(chosen, "reading", "episode")):
         frames = episodes.read(i, keys).frames
         if ft.WRENCH in frames:
@@ -69,6 +71,8 @@ def load_recordings(
         start = skip[n] if skip else 0
         state.append(np.concatenate([frames[key][start:] for key in config.proprioception], 1))
         actions.append(joint_changes(frames[ft.ACTION], frames[ft.STATE], meaning)[start:])
+        success = frames.get(ft.TRUTH_SUCCESS, np.zeros((len(frames[ft.STATE]), 1)))[start:, 0]
+        succeeded.append(np.maximum.accumulate(success) > 0)
         if images:
             tcp.append(frames[ft.TCP_POSE][start:])
             maps[n] = maps[n][start:]
@@ -88,6 +92,7 @@ def load_recordings(
         *parts,
         lengths=lengths,
         done=_done(episodes, chosen, lengths, config.control_hz),
+        succeeded=torch.from_numpy(np.concatenate(succeeded)),
         images=torch.from_numpy(np.concatenate(differences)) if config.end_to_end else None,
         maps=torch.from_numpy(np.concatenate(maps)) if images else None,
         key_pose=key_pose,
@@ -148,7 +153,7 @@ class SequenceDataset:
     Before an episode's start its first observation is repeated, as in diffusion_policy. Ticks after
     its end are padding (`action_is_pad`), which does not count in training. So is the last tick:
     its observation is the result of the last action, and the action recorded beside it was never
-    executed.
+    executed. Ticks after success, as in the maze when the bead is led on to its post, teach the end alone.
     """
 
     def __init__(
@@ -168,7 +173,8 @@ class SequenceDataset:
         planned = tick + np.arange(config.prediction_horizon)
         self._observed = torch.from_numpy(np.maximum(observed, first))
         self._planned = torch.from_numpy(np.minimum(planned, last))
-        self.action_is_pad: Bool[Tensor, "n h"] = torch.from_numpy(planned >= last)
+        after_end = torch.from_numpy(planned >= last)
+        self.action_is_pad: Bool[Tensor, "n h"] = after_end | recorded.succeeded[self._planned]
 
     def __len__(self) -> int:
         return len(self._observed)

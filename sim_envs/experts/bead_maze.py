@@ -14,7 +14,7 @@ _LEAD = 0.006  # m that the commanded bead may be ahead of the real one, which m
 _SLOW = 0.004  # m (or, times _LEVER, rad) of deviation at which motion along the wire stops
 _LEVER = 0.02  # m by which a turn counts as a displacement: the size of the bead
 _AT_POST = 0.388  # m of arc; the post stops the bead 1 to 4 mm behind
-_PRESS = 0.0015  # m that the commanded bead is ahead there: about 7 N
+_PRESS = 0.0015  # m that the commanded bead is ahead there when the hand stops: about 7 N
 _PRESSED_SECONDS = 0.7  # at the post, until the end is reached
 
 
@@ -31,23 +31,21 @@ class BeadMazeExpert(Actor):
     def act(self, observation: Observation) -> np.ndarray:
         """Return the action for the next tick; the observation is not used."""
         env = self._env
-        self._pressed += (at_post := env.arc_length > _AT_POST)
+        self._pressed += env.arc_length > _AT_POST
         self.done = self._pressed > _PRESSED_SECONDS * env.config.control_hz
-        if env.grasping:
-            return np.zeros(env.n_joints + 1)
         tick, grip = 1 / env.config.control_hz, self._grip()
         position, R = env.kinematics.forward(env.command)
         bead = position + R @ grip
         s = env.wire.project(bead, env.arc_length)
+        if env.grasping or min(env.arc_length - _AT_POST, s - env.arc_length - _PRESS) > 0:
+            return np.zeros(env.n_joints + 1)
         point, tangent = env.wire.at(s)
         off = bead - point
         turned = rotation_vector(fingers_across(tangent).T @ R)
         deviation = max(float(np.linalg.norm(off)), _LEVER * float(np.linalg.norm(turned)))
         ahead = _SPEED * tick * max(0.0, 1 - deviation / _SLOW)
         left = max(np.exp(-_RETURN * tick), 1 - _FASTEST * tick / max(deviation, 1e-9))
-        point, tangent = env.wire.at(
-            min(s + ahead, env.arc_length + (_PRESS if at_post else _LEAD))
-        )
+        point, tangent = env.wire.at(min(s + ahead, env.arc_length + _LEAD))
         R = fingers_across(tangent) @ rotation_matrix(left * turned)
         target = point + left * off - R @ grip
         joints = env.kinematics.solve_ik_near(target, R, env.command).q
