@@ -85,9 +85,8 @@ def test_a_stream_that_starts_with_one_frame_learns_its_noise() -> None:
     light = 1 + 0.002 * np.arange(80)
     height = np.zeros(80)
     height[50:70] = 25
-    jpegs = [
-        cv2.imencode(".jpg", f, [cv2.IMWRITE_JPEG_QUALITY, 60])[1] for f in sensed(light, height)
-    ]
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 60]
+    jpegs = [cv2.imencode(".jpg", frame, quality)[1] for frame in sensed(light, height)]
     frames = np.stack([np.asarray(cv2.imdecode(jpeg, 1)) for jpeg in jpegs])
     detector = ContactDetector(Background(frames[:1]))
     touching = [detector.update(frame) for frame in (*[frames[0]] * 5, *frames[1:])][5:]

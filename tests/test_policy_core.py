@@ -237,9 +237,8 @@ def test_a_pause_at_the_start_is_left_out(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_the_wrench_is_learned_beyond_the_first_ticks(tmp_path: Path) -> None:
-    ticks = [
-        {**t, ft.WRENCH: np.full(6, 3.0 + i, np.float32)} for i, t in enumerate(toy_observations(4))
-    ]
+    forces = [np.full(6, 3.0 + i, np.float32) for i in range(4)]
+    ticks = [{**t, ft.WRENCH: f} for t, f in zip(toy_observations(4), forces, strict=True)]
     episodes = EpisodeSet(record_ticks(tmp_path / "set", ticks))
     config = replace(TOY, touch_dim=0, touch="", proprioception=(ft.STATE, ft.WRENCH))
     for skip in ([0], [2]):

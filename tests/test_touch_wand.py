@@ -62,9 +62,8 @@ def test_recording_resumes_to_the_same_set(tmp_path: Path, monkeypatch: pytest.M
         record_touches(tmp_path / "part", "gelsight_mini", 5, 1, 1)
         resumed = record_touches(tmp_path / "part", "gelsight_mini", 5, count, 1)
         whole = record_touches(tmp_path / "whole", "gelsight_mini", 5, count, 1)
-        shards = [
-            record_touches(tmp_path / f"{i}", "gelsight_mini", 5, 3, 1, Shard(i, 2)) for i in (0, 1)
-        ]
+        given = "gelsight_mini", 5, 3, 1
+        shards = [record_touches(tmp_path / f"{i}", *given, Shard(i, 2)) for i in (0, 1)]
         with pytest.raises(UserError, match="another shard's episodes"):
             record_touches(tmp_path / "0", "gelsight_mini", 5, count, 1, Shard(1, 2))
     assert len(resumed) == len(whole) == count and resumed.checksum == whole.checksum
