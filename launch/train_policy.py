@@ -214,8 +214,9 @@ def main(config: Config) -> None:
     training_data.report_pauses(pauses[0], sets[0].fps, config.trim_pauses)
     skipped = pauses if config.trim_pauses else [None, None]
     workers = config.ray or config.workers
+    about = policy, touch, workers
     recordings = (
-        sequence_dataset.load_recordings(s, r, policy, touch, workers, skip, config.actions)
+        sequence_dataset.load_recordings(s, r, *about, skip, config.actions, config.judged)
         for (s, r), skip in zip(chosen, skipped, strict=True)
     )
     windows, validation = (sequence_dataset.SequenceDataset(r, policy) for r in recordings)

@@ -50,11 +50,12 @@ def load_recordings(
     workers: Workers = 1,
     skip: Sequence[int] | None = None,
     meaning: ActionMeaning = "change",
+    judged: bool = False,
 ) -> Recordings:
     """Read episodes, and embed those that have no embedding yet; a kill loses those in progress.
 
     At the start of each chosen episode `skip` ticks are left out; images and forces stay relative
-    to its very first tick. UserError: nothing chosen, a missing column, another rate or embedder
+    to its very first tick. Of `judged` ones a simulator's success is not read. UserError: nothing chosen, a missing column, another rate or embedder
     than the config's, or embeddings of other episodes.
     """
     _check(episodes, chosen, config, embedder)
@@ -62,7 +63,7 @@ def load_recordings(
     images = ImageEmbedder(config.images) if config.images else None
     maps = embed_episodes(episodes, chosen, images, workers) if images else []
     keys = [*config.proprioception, ft.STATE, ft.ACTION]
-    keys += [ft.TRUTH_SUCCESS] * (ft.TRUTH_SUCCESS in episodes.features)
+    keys += [ft.TRUTH_SUCCESS] * (ft.TRUTH_SUCCESS in episodes.features and not judged)
     touch, state, actions, succeeded, differences, tcp = [], [], [], [], [], []
     for n, i in enumerate(track(chosen, "reading", "episode")):
         frames = episodes.read(i, keys).frames
@@ -173,8 +174,7 @@ class SequenceDataset:
         planned = tick + np.arange(config.prediction_horizon)
         self._observed = torch.from_numpy(np.maximum(observed, first))
         self._planned = torch.from_numpy(np.minimum(planned, last))
-        after_end = torch.from_numpy(planned >= last)
-        self.action_is_pad: Bool[Tensor, "n h"] = after_end | recorded.succeeded[self._planned]
+        self.action_is_pad = torch.from_numpy(planned >= last) | recorded.succeeded[self._planned]
 
     def __len__(self) -> int:
         return len(self._observed)

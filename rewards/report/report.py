@@ -17,9 +17,7 @@ from touchgoal.rewards.report.tables import MOST_CURVES, ends_table, metrics_tab
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.json_file import write_json
 
-_LISTED = (
-    "source object outcome goal own_goal unit contact contact_source frames fps measured".split()
-)
+_LISTED = "source object outcome goal own_goal unit contact contact_source fps measured".split()
 """Facts of each trajectory in metrics.json."""
 
 
