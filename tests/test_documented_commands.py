@@ -197,8 +197,8 @@ def _the_job_is_done(desk: Path, cell_file: Path, shell: Shell) -> None:
     worst = ask_twin(read_cell_file(cell_file).task.twin, "truth")["worst"]
     assert worst["excess"] == 0 and worst["speed"] < 1
     assert shell(["reward-curves", str(run / "episodes"), "--out", str(run / "curves")]) == 0
-    report = json.loads((run / "curves" / "episode_000.json").read_text())
-    assert report["metrics"]["tactile"]["end"] < report["metrics"]["tactile"]["start"]
+    [report] = json.loads((run / "curves" / "metrics.json").read_text())
+    assert report["measured"]["tactile"]["end"] < report["measured"]["tactile"]["start"]
 
 
 @contextmanager
