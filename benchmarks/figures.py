@@ -40,14 +40,13 @@ def looks(metrics: Metrics) -> str:
 
 
 def mended(metrics: Metrics) -> str:
-    """Success of every row, and in how many trials the policy gave up, or ended falsely as done."""
-    rows = []
+    """Success that the policy called so, of every row; how often it gave up, or was falsely done."""
+    rows, kinds = [], ("gave up", "falsely done")
     for row in metrics["rows"]:
-        failures = Counter(trial["failure"] for trial in row["trials"])
-        counts = [
-            f", {failures[how]} {how}" for how in ("gave up", "falsely done") if how in failures
-        ]
-        rows.append(f"{row['what']} {_rate(row['trials'])}{''.join(counts)}")
+        trials = [t | {"success": t["late"] is not None} for t in row["trials"]]
+        failures = Counter(trial["failure"] for trial in trials)
+        counts = [f", {failures[how]} {how}" for how in kinds if how in failures]
+        rows.append(f"{row['what']} {_rate(trials)}{''.join(counts)}")
     return "; ".join(rows)
 
 

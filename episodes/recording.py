@@ -144,8 +144,8 @@ def record_episode(
     observation, info = env.reset(seed=spec.seed, options=spec.options)
     actor, expert = roles(env, spec)
     if expert is actor:
-        return to_episode(env, list(run(env, actor, observation, info, None, 0.0)), spec)
-    ticks = list(run(env, actor, observation, info, expert, 0.0))
+        return to_episode(env, list(run(env, actor, observation, info, outcome_seconds=0.0)), spec)
+    ticks = list(run(env, actor, observation, info, expert, outcome_seconds=0.0))
     episode = to_episode(env, ticks, spec)
     return replace(episode, meta={**episode.meta, "outcome": CORRECTED})
 

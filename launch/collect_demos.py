@@ -91,7 +91,7 @@ def main(config: Config) -> None:
     kept = f"finished episodes are in {root}; the same command with --out {out} continues"
     try:
         with on_interruption(lambda: kept):
-            # the maze's bead is led on to where the end is felt; its expert says when that is
+            # in the maze success comes 3 cm before the post, where the end is felt and the expert is done
             env = replace(config.env, ends_by_success=config.task != "bead-maze")
             metas = recording.collect(root, env, missing, config.ray or config.workers, roles, most)
     except recording.NoSuccessError as error:

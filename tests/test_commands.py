@@ -72,10 +72,10 @@ def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
     run("reward-curves", episodes, *goals, "--index", 0, "--plain", "--out", bare)
     image = cv2.imread(str(out / "episode_000.png"))
     assert image is not None and image.shape == (1000, 1200, 3)
-    told, plain = (json.loads((f / "metrics.json").read_text())[0] for f in (out, bare))
+    facts, plain = (json.loads((f / "metrics.json").read_text())[0] for f in (out, bare))
     parts = "front wrist wrist_map object force centre held slip words wrench value fused"
-    assert told["source"] == "episodes#0" and told["contact_source"] == "truth"
-    report, plain = told["measured"], plain["measured"]
+    assert facts["source"] == "episodes#0" and facts["contact_source"] == "truth"
+    report, plain = facts["measured"], plain["measured"]
     assert set(report) == set(parts.split())
     assert set(plain) == {"image", "tactile", "text", "image+tactile", "image+text"}
     rows = (out / "episode_000.csv").read_text().splitlines()

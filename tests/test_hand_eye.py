@@ -101,8 +101,7 @@ def test_the_error_is_the_printed_one_whatever_the_arms(camera: str, arm_off: fl
         closed.append(error_of(X, result.closed_form)[0])
         # A view left out is off by its own error (0.9 mm along three axes) and the result's.
         assert 0.5 < 1e3 * result.position_errors.mean() / arm_off < 2.0
-    squares = (np.square(values) for values in (errors, printed, closed))
-    rms, told, by_closed_form = (np.sqrt(np.mean(square, axis=0)) for square in squares)
+    rms, told, by_closed_form = (np.mean(np.square(v), 0) ** 0.5 for v in (errors, printed, closed))
     assert rms[0] < 2.0 * arm_off
     assert ((rms / told > 0.4) & (rms / told < 1.5)).all(), rms / told
     assert rms[0] < by_closed_form or arm_off > 1

@@ -276,6 +276,7 @@ def test_tables_for_lerobot(episodes: Path, tmp_path: Path) -> None:
     signals = set(table.column_names) - {"index", "episode_index", "frame_index"}
     assert about["descriptors"].keys() == signals and about["episode_indices"] == [0, 1, 2, 3]
     assert about["descriptors"]["cost_image"]["direction"] == "lower"
+    assert about["provenance"]["camera"] == FRONT and about["provenance"]["normalizer"]
     assert not (tmp_path / "touchgoal_progress.parquet").exists(), "raw distances are no progress"
 
 

@@ -55,8 +55,8 @@ def load_recordings(
     """Read episodes, and embed those that have no embedding yet; a kill loses those in progress.
 
     At the start of each chosen episode `skip` ticks are left out; images and forces stay relative
-    to its very first tick. Of `judged` ones a simulator's success is not read. UserError: nothing chosen, a missing column, another rate or embedder
-    than the config's, or embeddings of other episodes.
+    to its very first tick. Of `judged` ones a simulator's success is not read. UserError: nothing
+    chosen, a missing column, another rate or embedder than the config's, or other embeddings.
     """
     _check(episodes, chosen, config, embedder)
     embedded = embed_episodes(episodes, chosen, embedder, workers) if embedder else None

@@ -13,9 +13,9 @@ _FASTEST = 0.02  # m/s (or, times _LEVER, rad/s): fastest return from a large de
 _LEAD = 0.006  # m that the commanded bead may be ahead of the real one, which may be jammed
 _SLOW = 0.004  # m (or, times _LEVER, rad) of deviation at which motion along the wire stops
 _LEVER = 0.02  # m by which a turn counts as a displacement: the size of the bead
-_AT_POST = 0.388  # m of arc; the post stops the bead 1 to 4 mm behind
+_AT_POST = 0.388  # m of arc; the post stops the bead 1 to 4 mm further on
 _PRESS = 0.0015  # m that the commanded bead is ahead there when the hand stops: about 7 N
-_PRESSED_SECONDS = 0.7  # at the post, until the end is reached
+_PRESSED_SECONDS = 0.7  # s at the post after which it is done
 
 
 class BeadMazeExpert(Actor):
@@ -26,18 +26,19 @@ class BeadMazeExpert(Actor):
     """
 
     def __init__(self, env: BeadMaze) -> None:
-        self._env, self._pressed = env, 0
+        self._env, self._ticks_at_post = env, 0
 
     def act(self, observation: Observation) -> np.ndarray:
         """Return the action for the next tick; the observation is not used."""
         env = self._env
-        self._pressed += env.arc_length > _AT_POST
-        self.done = self._pressed > _PRESSED_SECONDS * env.config.control_hz
+        self._ticks_at_post += env.arc_length > _AT_POST
+        self.done = self._ticks_at_post > _PRESSED_SECONDS * env.config.control_hz
         tick, grip = 1 / env.config.control_hz, self._grip()
         position, R = env.kinematics.forward(env.command)
         bead = position + R @ grip
         s = env.wire.project(bead, env.arc_length)
-        if env.grasping or min(env.arc_length - _AT_POST, s - env.arc_length - _PRESS) > 0:
+        pressed = env.arc_length > _AT_POST and s > env.arc_length + _PRESS
+        if env.grasping or pressed:
             return np.zeros(env.n_joints + 1)
         point, tangent = env.wire.at(s)
         off = bead - point
