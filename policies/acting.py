@@ -29,7 +29,7 @@ from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskName, task_name
 
 Task = TypeVar("Task", bound=EnvConfig)
 
-_USUAL_AGE = 0.1  # s; the oldest measurement is at most so old as deployed, see `AS_DEPLOYED`
+_USUAL_AGE = 0.1  # s; the oldest measurement is at most so old as deployed, see `DeploymentConfig`
 
 
 @runtime_checkable
@@ -308,7 +308,7 @@ class LearnedPolicy(Planner):
                 f"{self._name} was trained with the sensor {other}, the task has {sensor}: choose "
                 f"{other} (--env.sensor {other}), or another policy"
             )
-        self._check_delay(max(task.resolved_deployment().plan_ticks or (0,)))
+        self._check_delay(max(task.deployment.plan_ticks) if task.as_deployed else 0)
 
     def _check_delay(self, plan_ticks: int) -> None:
         """Raise UserError if plans are too short for this delay."""

@@ -18,7 +18,7 @@ from touchgoal.runtime.option_types import (
     Positive,
     checked_dataclass,
 )
-from touchgoal.sim_envs.cell.deployment import AS_DEPLOYED, IDEAL_DEPLOYMENT, DeploymentConfig
+from touchgoal.sim_envs.cell.deployment import DeploymentConfig
 from touchgoal.sim_envs.scene.lighting import USUAL, Lighting
 from touchgoal.sim_envs.scene.objects import CATALOGUE, find_object
 from touchgoal.sim_envs.scene.wires import (
@@ -190,26 +190,23 @@ class EnvConfig(SceneConfig):
     as_deployed: bool = False
     """Simulate the delays, limits and measurement errors of an arm driven by `deploy`."""
     deployment: DeploymentConfig = DeploymentConfig()
-    """Overrides of single settings of `--env.as-deployed`."""
-
-    def resolved_deployment(self) -> DeploymentConfig:
-        """Return the deployment with every field set."""
-        base = AS_DEPLOYED if self.as_deployed else IDEAL_DEPLOYMENT
-        own = {name: value for name, value in vars(self.deployment).items() if value is not None}
-        return replace(base, **own)
+    """Delays with `--env.as-deployed`."""
 
     def reset_options(self, count: int | None = None) -> list[dict[str, Any]]:
         """Return options of `reset` for episodes to take in turn, `count` of them if it matters."""
         return [{}]
 
     def __post_init__(self) -> None:
-        """Raise ValueError if a tick is no whole number of set-points, or an episode has none."""
+        """Raise ValueError if a tick is no whole number of set-points, an episode has none, or delays
+        are given that would do nothing."""
         setpoints = 1 / self.control_hz / SETPOINT_PERIOD
         if round(setpoints) < 1 or abs(setpoints - round(setpoints)) >= 1e-6:
             raise ValueError(
                 f"control_hz is {self.control_hz}; it must divide 500 (10, 20, 25, 50, 100, ...), "
                 "because set-points come every 2 ms"
             )
+        if self.deployment != DeploymentConfig() and not self.as_deployed:
+            raise ValueError("deployment has delays, which need as_deployed (--env.as-deployed)")
         if self.max_seconds * self.control_hz < 1:
             raise ValueError(f"max_seconds must be at least a tick of 1/{self.control_hz} s")
 

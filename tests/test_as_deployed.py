@@ -1,4 +1,4 @@
-"""An environment as deployed: what is late is late by what it says, and what is off changes nothing."""
+"""An environment as deployed: what is late is late by what it says."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,20 +8,21 @@ import pytest
 
 from touchgoal.control import features as ft
 from touchgoal.control.safety.limits import TASK_FORCES
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.cell.deployment import DeploymentConfig
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
-# Through the code of a deployment, and yet nothing between: plans are late, which no action here is.
-PLAIN = DeploymentConfig(plan_ticks=(1,))
+NO = (0.0, 0.0)
+PROMPT = DeploymentConfig(NO, NO, image_rate=1000.0, command_delay=NO, jitter=NO)
 
 
 def roll(actions, config=BLIND, seed=3, between=None):
-    """Observations of these actions, the reset's first; with options of the deployment."""
+    """Observations of these actions, the reset's first; with delays in place of none."""
     if between is not None:
-        config = replace(config, deployment=replace(PLAIN, **between))
+        config = replace(config, as_deployed=True, deployment=replace(PROMPT, **between))
     env = PickPlace(config)
     seen = [env.reset(seed=seed, options={"object": "wooden_block"})[0]]
     seen += [env.step(action)[0] for action in actions]
@@ -39,11 +40,9 @@ def column(seen, key=ft.STATE):
     return np.stack([observation[key] for observation in seen])
 
 
-def test_nothing_between_is_the_plain_environment() -> None:
-    plain, through = (column(roll(moving(), between=between)) for between in (None, {}))
-    # Set-points every ms in place of every 2: no more than that.
-    assert np.abs(plain - through)[:, :7].max() < 2e-4
-    assert not BLIND.resolved_deployment().tracker
+def test_delays_that_would_do_nothing_are_refused() -> None:
+    with pytest.raises(UserError, match="need as_deployed"):
+        replace(BLIND, deployment=PROMPT)
 
 
 @pytest.mark.parametrize("option", ["state_delay", "image_delay"])
@@ -92,8 +91,8 @@ def test_commands_are_seen_without_delay() -> None:
 
 def test_the_truth_of_the_pads_is_as_old_as_their_images() -> None:
     def contact(delay: float) -> np.ndarray:
-        between = replace(PLAIN, image_delay=(delay, delay))
-        env = BeadMaze(BeadMazeConfig(cameras=(), tactile=False, deployment=between))
+        late = {"as_deployed": True, "deployment": replace(PROMPT, image_delay=(delay, delay))}
+        env = BeadMaze(BeadMazeConfig(cameras=(), tactile=False, **late))
         env.reset(seed=3)
         infos = [env.step(np.zeros(8))[-1] for _ in range(12)]
         return np.stack([info[ft.TRUTH_PAD_WRENCH] for info in infos])

@@ -127,7 +127,7 @@ def test_learning_the_bead_maze(here: Path, capsys: pytest.CaptureFixture) -> No
     assert set(tried) == {"epoch-0001", "epoch-0002"}
     capsys.readouterr()
     run("run-policy", "--task", "bead-maze", "--policy", "policy/policy", "--episodes", 1, *one,
-        "--env.deployment.plan-ticks", 2, "--no-video", "--env.max-seconds", 1)  # fmt: skip
+        "--env.as-deployed", "--env.deployment.plan-ticks", 2, "--no-video", "--env.max-seconds", 1)  # fmt: skip
     assert "0/1" in capsys.readouterr().out
     run_benchmark("bead-maze", "--policies", "policy/policy", "--wires", 1, "--held-out", 0,
         "--demonstrations", 2, "--plan-ticks", "--env.max-seconds", 3, *one)  # fmt: skip

@@ -114,9 +114,7 @@ def test_the_same_actions_lead_to_the_same_place_in_the_environment_and_over_the
 ) -> None:
     pytest.importorskip("franky", reason=FRANKY.install)
     none, delay, seed = (0.0, 0.0), (0.005, 0.005), 1  # s from a command to the arm on the wire
-    late = DeploymentConfig(
-        command_delay=delay, state_delay=none, jitter=none, estimated_wrench=False
-    )
+    late = DeploymentConfig(command_delay=delay, state_delay=none, jitter=none)
     task = PickPlaceConfig(objects=("wooden_block",), cameras=(), as_deployed=True, deployment=late)
     env = PickPlace(task)
     env.robot = able_to_press(env.robot)

@@ -190,7 +190,7 @@ def test_a_stop_while_embedding_costs_one_episode(tmp_path: Path) -> None:
 
 def test_what_comes_next_has_the_options_of_the_task() -> None:
     late = DeploymentConfig(image_delay=(0.0, 0.05))
-    env = PickPlaceConfig(objects=("wooden_block",), cameras=(), tactile=False, deployment=late)
+    env = PickPlaceConfig(objects=("wooden_block",), as_deployed=True, deployment=late)
     _, twin = read_options("twin", shlex.split(_changed_options(env, RunPolicy.env)))
     assert replace(twin.env, camera_size=env.camera_size) == env
     assert not _changed_options(RunPolicy.env, RunPolicy.env)

@@ -63,8 +63,6 @@ class Config(TrialOptions):
 
     tasks: tuple[TaskName, ...] = get_args(SimulatedTask)
     """Tasks; the maze is on test wires."""
-    as_deployed: bool = True
-    """Let the arm behave as deployed."""
     changes: tuple[str, ...] = ()
     """Changes to try, such as "light -15%"; default: all of the task, and none."""
     hidden_verdict: bool = False
@@ -94,14 +92,10 @@ def run(config: Config) -> dict[str, Any]:
 
 def _environments(config: Config, task: TaskName) -> dict[str, TaskConfig]:
     base = replace(deployed(task), ends_by_success=not config.hidden_verdict)
-    base = base if config.as_deployed else replace(base, as_deployed=False)
+    delays, longer = _DELAYED | _FROZEN if base.as_deployed else {}, _LONGER * base.max_seconds
     late = {
-        name: replace(
-            base,
-            deployment=replace(base.deployment, **change),
-            max_seconds=_LONGER * base.max_seconds,
-        )
-        for name, change in (_DELAYED | _FROZEN).items()
+        name: replace(base, deployment=replace(base.deployment, **change), max_seconds=longer)
+        for name, change in delays.items()
     }
     changed = {name: replace(base, **change) for name, change in _CHANGES.get(task, {}).items()}
     return {UNCHANGED: base, **changed, **late}

@@ -31,32 +31,8 @@ Joints = Float[np.ndarray, " n"]
 Value = TypeVar("Value")
 
 
-class _DirectDrive:
-    """Set-points without deployment: a straight line to each target, within one tick."""
-
-    def __init__(self, start: Joints, limits: Float[np.ndarray, "n 2"], ticks: int) -> None:
-        self.command, self._limits, self._ticks = start, limits, ticks
-        self._now = self._target = start
-        self._left = 0
-
-    def accept(self, delta: Joints) -> Joints:
-        """Return the target (rad) of a tick's joint change (rad)."""
-        self.command = np.clip(self.command + delta, self._limits[:, 0], self._limits[:, 1])
-        return self.command
-
-    def set_target(self, target: Joints) -> None:
-        self._target, self._left = target, self._ticks
-
-    def step(self) -> Joints:
-        """Return the servo's set-point (rad) of the next millisecond."""
-        if self._left:
-            self._now = self._now + (self._target - self._now) / self._left
-            self._left -= 1
-        return self._now
-
-
 class _TrackedDrive:
-    """Set-points as deployed: lag, safety layer and tracker; see `_DirectDrive`."""
+    """Set-points as `deploy` makes them, by lag, safety layer and tracker."""
 
     def __init__(self, start: Joints, safety: ActionFilter) -> None:
         self._safety, self._state = safety, safety.start(start)
@@ -71,6 +47,7 @@ class _TrackedDrive:
         return self._state.q + self._lag.remaining
 
     def accept(self, delta: Joints) -> Joints:
+        """Return the target (rad) of a tick's joint change (rad)."""
         step = self._lag.update(delta)
         at_rest = measurements_at_rest(self._state.q)
         self._state = self._safety.filter_action(self._state, step, at_rest)
@@ -80,6 +57,7 @@ class _TrackedDrive:
         self._track = self._tracker.set_target(self._track, target)
 
     def step(self) -> Joints:
+        """Return the servo's set-point (rad) of the next millisecond."""
         before = self._track.q
         self._track = self._tracker.step(self._track)
         return self._track.q + SERVO_DAMPING * (self._track.q - before) / _DT
@@ -137,33 +115,22 @@ class DeployedArm:
         Args:
             hardware: arm, hand and sensors.
             start: commanded joints at first, rad.
-            deployment: a resolved config.
+            deployment: ranges of the delays.
             rng: draws delays and errors.
         """
-        assert deployment.plan_ticks is not None
         self._hardware = hardware
         hz = hardware.config.control_hz
         self._tick_ms = round(1000 / hz)
-        if deployment.tracker:
-            hardware.release_setpoints()
-            self._drive: _TrackedDrive | _DirectDrive = _TrackedDrive(
-                start, ActionFilter(hardware.robot, hz)
-            )
-        else:
-            self._drive = _DirectDrive(start, hardware.setpoint_range, self._tick_ms)
-        stroke = hardware.robot.tool.stroke
-        self._hand = (
-            DeployedHand(hardware.width, stroke[1], rng) if deployment.franka_hand else None
-        )
-        self._wrench = EstimatedWrench(rng) if deployment.estimated_wrench else None
+        hardware.release_setpoints()
+        self._drive = _TrackedDrive(start, ActionFilter(hardware.robot, hz))
+        self._hand = DeployedHand(hardware.width, hardware.robot.tool.stroke[1], rng)
+        self._wrench = EstimatedWrench(rng)
         self.plan_ticks = int(rng.choice(deployment.plan_ticks))  # by which learned plans are late
         ticks = round(hardware.config.max_seconds * hz) + _AHEAD
-        jitter = rng.uniform(*_range(deployment.jitter))
+        jitter = rng.uniform(*deployment.jitter)
         self._state_at = _read_times(rng, deployment.state_delay, jitter, ticks, self._tick_ms)
-        period = 1000 / (deployment.image_rate or 1000.0)
-        self._image_at = _read_times(
-            rng, deployment.image_delay, jitter, ticks, self._tick_ms, period
-        )
+        taken = rng, deployment.image_delay, jitter, ticks, self._tick_ms
+        self._image_at = _read_times(*taken, 1000 / deployment.image_rate)
         delays = _delays(rng, deployment.command_delay, jitter, ticks)
         # A command never overtakes the one before it.
         self._arrives = np.maximum.accumulate(np.arange(ticks) * self._tick_ms + delays)
@@ -192,7 +159,7 @@ class DeployedArm:
             while self._commands and self._commands[0][0] <= self._ms:
                 _, target, self._width = self._commands.popleft()
                 self._drive.set_target(target)
-            width = self._hand.step(self._ms, self._width) if self._hand else self._width
+            width = self._hand.step(self._ms, self._width)
             hardware.step_physics(self._drive.step(), width, speed, self._steps)
             self._ms += 1
             self._measure(self._ms in reads, self._ms in shots)
@@ -211,12 +178,12 @@ class DeployedArm:
 
     def _measure(self, read: bool, shoot: bool) -> None:
         hardware = self._hardware
-        wrench = self._wrench if self._ms % _WRENCH_PERIOD == 0 else None
-        if not (read or shoot or wrench):
+        estimate = self._ms % _WRENCH_PERIOD == 0
+        if not (read or shoot or estimate):
             return
         hardware.update_contacts()
-        if wrench:
-            wrench.update(hardware.external_wrench(), _WRENCH_PERIOD * _DT)
+        if estimate:
+            self._wrench.update(hardware.external_wrench(), _WRENCH_PERIOD * _DT)
         if read:
             self._states[self._ms] = self._read_state()
         if shoot:
@@ -224,10 +191,8 @@ class DeployedArm:
 
     def _read_state(self) -> dict[str, np.ndarray]:
         state = self._hardware.read_proprioception()
-        if self._wrench:
-            state[ft.WRENCH] = self._wrench.read().astype(np.float32)
-        if self._hand:
-            state[ft.STATE][-1] = self._hand.width
+        state[ft.WRENCH] = self._wrench.read().astype(np.float32)
+        state[ft.STATE][-1] = self._hand.width
         return state
 
     def _moments(self, at: Int[np.ndarray, " t"], end: int) -> set[int]:
@@ -249,22 +214,17 @@ def measurements_at_rest(q: Joints) -> Measurements:
     )
 
 
-def _range(given: tuple[float, float] | None) -> tuple[float, float]:
-    assert given is not None, "a resolved config, see EnvConfig.resolved_deployment"
-    return given
-
-
 def _delays(
-    rng: np.random.Generator, delay: tuple[float, float] | None, jitter: float, ticks: int
+    rng: np.random.Generator, delay: tuple[float, float], jitter: float, ticks: int
 ) -> Int[np.ndarray, " t"]:
     """Draw each tick's delay (ms): one delay for the episode, plus jitter."""
-    drawn = rng.uniform(*_range(delay)) + rng.uniform(0, 1, ticks) * jitter
+    drawn = rng.uniform(*delay) + rng.uniform(0, 1, ticks) * jitter
     return np.round(drawn * 1000).astype(int)
 
 
 def _read_times(
     rng: np.random.Generator,
-    delay: tuple[float, float] | None,
+    delay: tuple[float, float],
     jitter: float,
     ticks: int,
     tick_ms: int,

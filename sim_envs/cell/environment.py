@@ -14,7 +14,6 @@ from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.deployed_arm import DeployedArm
-from touchgoal.sim_envs.cell.deployment import IDEAL_DEPLOYMENT
 from touchgoal.sim_envs.cell.hardware import SimulatedHardware
 from touchgoal.sim_envs.config import (
     SETPOINT_PERIOD,
@@ -287,10 +286,9 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         self._ticks = 0
         self._force.reset()
         self._deployed: DeployedArm | None = None
-        deployment = self.config.resolved_deployment()
-        if deployment != IDEAL_DEPLOYMENT:
+        if self.config.as_deployed:
             rng = self.np_random.spawn(1)[0]
-            self._deployed = DeployedArm(self, self.command.copy(), deployment, rng)
+            self._deployed = DeployedArm(self, self.command.copy(), self.config.deployment, rng)
 
     def _observe(self) -> Observation:
         velocity = (self.command - self._command_before) * self.config.control_hz
@@ -309,7 +307,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
     @property
     def max_joint_step(self) -> Float[np.ndarray, " n"] | None:
         """Largest joint change (rad) that the safety layer lets through; None without one."""
-        clamped = self.config.resolved_deployment().tracker
+        clamped = self.config.as_deployed
         return self.robot.policy.velocity / self.config.control_hz if clamped else None
 
     def calibrated_camera(self) -> CameraPlacement:
