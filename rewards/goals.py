@@ -190,10 +190,7 @@ class Sentence:
     modalities: ClassVar[tuple[Modality, ...]] = ("text",)
 
     def __post_init__(self) -> None:
-        """Check the sentence."""
         check_goal_sentence(self.text)
-        if "|" in self.text:  # which parted it from a second one
-            raise UserError(f"goal '{self}': give one sentence, without |")
 
     def __str__(self) -> str:
         return f"text:{self.text}"
@@ -207,7 +204,6 @@ class GripForce:
     modalities: ClassVar[tuple[Modality, ...]] = ("force",)
 
     def __post_init__(self) -> None:
-        """Check the force."""
         if not 0 < self.newtons < math.inf:
             raise UserError(f"goal '{self}': a force is above 0 N, such as force:3.5")
 

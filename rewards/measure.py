@@ -32,7 +32,7 @@ from touchgoal.runtime.progress import progress_bar
 from touchgoal.runtime.version import __version__
 
 SKIPPED = "skipped.csv"
-_RECORDS, _FORMAT = "measured", 3
+_RECORDS, _FORMAT = "measured", 4
 Count = Callable[[int], object]
 """Callback with the number of frames done."""
 EncoderOptions = tuple[Inputs, str | None, str | None, bool]

@@ -31,7 +31,6 @@ class CurveMetrics:
     the net drop is d_0 - d_T. Times of drops are None unless the net drop exceeds eps.
     """
 
-    frames: int  # n
     sigma: float  # noise (curve), 1.4826 MAD(diff d) / sqrt 2 before the contact
     eps: float  # max(3 sigma, EPS_FLOOR) (curve)
     start: float  # d_0 (curve)
@@ -45,8 +44,9 @@ class CurveMetrics:
     t_drop_10: int | None  # first frame at which 10 % of the net drop has fallen
     t_drop_25: int | None  # the same for 25 %
     t_drop_50: int | None  # the same for 50 %, the primary one
-    contact: int | None  # first contact frame, as given
-    contact_lag: int | None  # t_drop_50 - contact (frames); negative if it falls before contact
+    contact_lag: (
+        int | None
+    )  # t_drop_50 - first contact (frames); negative if it falls before contact
 
 
 def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> CurveMetrics:
@@ -77,7 +77,6 @@ def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> Cu
         for share in (0.10, 0.25, 0.50)
     ]
     return CurveMetrics(
-        frames=len(d),
         sigma=sigma,
         eps=eps,
         start=start,
@@ -89,7 +88,6 @@ def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> Cu
         t_drop_10=falls[0],
         t_drop_25=falls[1],
         t_drop_50=falls[2],
-        contact=contact,
         contact_lag=None if falls[2] is None or contact is None else falls[2] - contact,
     )
 

@@ -11,7 +11,7 @@ from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import Goals
-from touchgoal.rewards.judging.end_state import end_cost, end_costs
+from touchgoal.rewards.judging.end_state import end_costs
 from touchgoal.rewards.judging.judge import FIT_JUDGE, JUDGE, Judge, Judgement
 from touchgoal.rewards.value import Value
 from touchgoal.runtime.errors import UserError
@@ -46,8 +46,7 @@ class PreparedReward:
 
     def judge_episode(self, episode: EmbeddedEpisode) -> Judgement:
         """Return the judgement of an episode that `embedder` embedded; UserError without a judge."""
-        judge, parts = self.judge, self.end_costs(episode)
-        return judge.judge(parts, end_cost(parts))
+        return self.judge.judge(self.end_costs(episode))
 
     def curves(
         self, trajectory: EmbeddedEpisode, before: Mapping[str, float] | None = None

@@ -329,19 +329,12 @@ class Reward:
     def _embed_episode(
         self, episode: Episode, camera: str, fps: float, scene: str
     ) -> tuple[PreparedReward, EmbeddedEpisode]:
-        sensor = episode.meta.get("sensor")
+        sensor, frames = episode.meta.get("sensor"), episode.frames
         if sensor is None and scene == _ARRAYS and self._encoder is None:
             sensor = pretrained.DEFAULT_ENCODER.name
-        inputs = Inputs.of(
-            "this trajectory",
-            episode.frames,
-            camera,
-            sensor=None if sensor is None else str(sensor),
-            scene=scene,
-            length=len(episode),
-            task=episode.task,
-        )
-        frames = episode.frames
+        about = {"scene": scene, "length": len(episode), "task": episode.task}
+        about["sensor"] = sensor and str(sensor)
+        inputs = Inputs.of("this trajectory", frames, camera, **about)
         goals = [g.beside(frames) if isinstance(g, TouchArrays) else g for g in self.goals]
         prepared = self.prepare(inputs, goals)
         return prepared, prepared.embedder.embed_chunks([episode], fps, inputs.name)

@@ -19,7 +19,7 @@ from touchgoal.rewards.distance.parts import (
     object_distances,
     part_costs,
     part_distances,
-    smooth,
+    smooth_and_fuse,
     soft_minimum,
 )
 from touchgoal.rewards.features.contact_reading import ContactReader, SlipMeter
@@ -187,9 +187,9 @@ def test_distances_by_hand() -> None:
     two = soft_minimum(np.array([[0.1, 0.4], [0.3, 0.3]]))
     assert two == pytest.approx([0.1, 0.3], abs=1e-4)
     cost = np.random.default_rng(0).random(9)
-    pieces = [smooth(cost[:4], 20)]
-    pieces.append(smooth(cost[4:], 20, float(pieces[0][-1])))
-    assert np.concatenate(pieces) == pytest.approx(smooth(cost, 20))
+    whole, begun = (smooth_and_fuse({"held": c}, 20, None)["held"] for c in (cost, cost[:4]))
+    after = smooth_and_fuse({"held": cost[4:]}, 20, {"held": float(begun[-1])})["held"]
+    assert np.concatenate([begun, after]) == pytest.approx(whole)
 
 
 def test_a_grasp_slips_from_where_it_settled() -> None:

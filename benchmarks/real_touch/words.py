@@ -30,7 +30,7 @@ from touchgoal.episodes.importers.labelled_videos import (
     firmest_frames,
     read_labelled_videos,
 )
-from touchgoal.rewards.distance.cost import text_distances
+from touchgoal.rewards.distance.parts import cosine_distances
 from touchgoal.rewards.report.tables import aligned
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
@@ -186,7 +186,7 @@ def _hardness(
 def _nearer(encoder: PooledEncoder, towers: Towers, videos: Videos, word: str) -> float:
     """Return how often the right one of two videos, with most and least of a property, costs less."""
     goal = encoder.embed_text_goal([f"a {word} surface"], towers)
-    distance, k = text_distances(videos.touch[:, None], goal)[:, 0], _SURFACES[word]
+    distance, k = cosine_distances(videos.touch, goal)[:, 0], _SURFACES[word]
     true = RANK_WORDS[k].index(word)
     right, wrong = (distance[videos.ranks[:, k] == rank] for rank in (true, N_RANKS - 1 - true))
     pairs = right[:, None] < wrong

@@ -7,7 +7,7 @@ distance to a force goal is a share of it, 1 without contact; as the unit of its
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer
@@ -86,7 +86,7 @@ def plain_distances(mine: Features, goal: Features, completed: bool) -> Costs:
         touch, goals = (complete(f[TOUCH]) if completed else f[TOUCH] for f in (mine, goal))
         raw["tactile"] = soft_minimum(touch_distances(touch, goals))
     if TEXT in goal:
-        raw["text"] = soft_minimum(text_distances(mine[TOUCH], goal[TEXT]))
+        raw["text"] = soft_minimum(cosine_distances(mine[TOUCH].mean(1, np.float64), goal[TEXT]))
     return raw
 
 
@@ -98,10 +98,3 @@ def complete(touch: Float32[np.ndarray, "*n k"]) -> Float32[np.ndarray, "*n k+1"
     """
     missing = 1 - np.square(touch).sum(-1, keepdims=True)
     return np.concatenate([touch, np.sqrt(np.maximum(missing, 0))], -1)
-
-
-def text_distances(
-    touch: Float32[np.ndarray, "n sides k"], goals: Float32[np.ndarray, "g k"]
-) -> Float[np.ndarray, "n g"]:
-    """Return the distance of each touch to each sentence, mean over the fingertips."""
-    return 1 - np.mean(touch, axis=1, dtype=np.float64) @ goals.astype(np.float64).T

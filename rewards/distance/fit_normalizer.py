@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.rewards.distance.cost import text_distances
 from touchgoal.rewards.distance.normalizer import DistanceNormalizer, median_name
 from touchgoal.rewards.distance.parts import (
     SMALLEST_UNIT,
@@ -114,8 +113,6 @@ def fit_units(episodes: Sequence[EmbeddedEpisode]) -> dict[str, float]:
 
 
 def _check_training(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality]) -> None:
-    if not episodes:
-        raise UserError("a normalizer needs at least one successful training episode, got none")
     for e in episodes:
         if missing := [m for m in modalities if m not in e.modalities]:
             raise UserError(
@@ -145,7 +142,7 @@ def _training_distances(
         if modality == "tactile":
             goals = [o for o in goals if o.object == e.object]
         if modality == "text":
-            d = text_distances(e.features[TOUCH], e.descriptions)
+            d = cosine_distances(e.features[TOUCH].mean(1, np.float64), e.descriptions)
         elif not goals:
             continue
         elif modality == "image":

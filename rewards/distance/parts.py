@@ -91,9 +91,9 @@ def part_distances(mine: Features, goal: Features) -> dict[str, Float[np.ndarray
 
 
 def cosine_distances(
-    mine: Float32[np.ndarray, "n d"], goals: Float32[np.ndarray, "g d"]
+    mine: Float[np.ndarray, "n d"], goals: Float32[np.ndarray, "g d"]
 ) -> Float[np.ndarray, "n g"]:
-    """Return 1 - cos between unit vectors."""
+    """Return 1 - the dot product of each with each goal: 1 - cos of unit vectors."""
     return 1 - mine.astype(np.float64) @ goals.astype(np.float64).T
 
 
@@ -175,12 +175,15 @@ def goal_spread(goal: Features) -> dict[str, float]:
 def smooth_and_fuse(
     parts: Mapping[str, Float[np.ndarray, " n"]], fps: float, before: Mapping[str, float] | None
 ) -> Costs:
-    """Return the smoothed parts and "fused": their root mean square, and a share of the value.
+    """Return the parts, smoothed exponentially, and "fused": their root mean square, and a share of the value.
 
     `before` has the costs of the previous frame, None at the beginning. Empty without parts.
     """
-    last = before or {}
-    smoothed = {name: smooth(cost, fps, last.get(name)) for name, cost in parts.items()}
+    keep, last = np.exp(-1 / (fps * SMOOTHING)), before or {}
+    smoothed = {
+        name: lfilter([1 - keep], [1, -keep], cost, zi=[keep * last.get(name, cost[0])])[0]
+        for name, cost in parts.items()
+    }
     equal = [cost for name, cost in smoothed.items() if name != VALUE]
     if not equal:
         return {}
@@ -188,15 +191,6 @@ def smooth_and_fuse(
     if VALUE in smoothed:
         fused = VALUE_SHARE * smoothed[VALUE] + (1 - VALUE_SHARE) * fused
     return smoothed | {FUSED: fused}
-
-
-def smooth(
-    cost: Float[np.ndarray, " n"], fps: float, before: float | None = None
-) -> Float[np.ndarray, " n"]:
-    """Smooth costs exponentially, looking back only; `before` is the smoothed previous cost."""
-    keep = np.exp(-1 / (fps * SMOOTHING))
-    start = cost[0] if before is None else before
-    return lfilter([1 - keep], [1, -keep], cost, zi=[keep * start])[0]
 
 
 def unit_map(maps: Float16[np.ndarray, "n c y x"]) -> Float[np.ndarray, "n c p"]:

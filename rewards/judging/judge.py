@@ -92,8 +92,9 @@ class Judge:
         accept, refuse = self.limits
         return "success" if cost <= accept else "failure" if cost > refuse else "unsure"
 
-    def judge(self, parts: Mapping[str, float], cost: float) -> Judgement:
-        """Return the judgement of an end."""
+    def judge(self, parts: Mapping[str, float]) -> Judgement:
+        """Return the judgement of an end, by the cost of its parts."""
+        cost = end_cost(parts)
         far = sorted((n for n in parts if parts[n] > _FAR), key=lambda name: -parts[name])
         reasons = tuple(_SAYS.get(n, _SAYS["wrist"].replace("wrist", n)) for n in far)
         return Judgement(self.verdict(cost), cost, parts, reasons)

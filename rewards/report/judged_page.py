@@ -88,7 +88,7 @@ def report(
     """Write what the judge, as it is now, and persons say; return it, doubtful ones first."""
     middle = sum(judge.limits) / 2  # the doubtful ones are nearest to it, then those near a limit
     ends = [
-        JudgedEnd(t, judge.judge(one.parts, one.cost), told.get(t.index))
+        JudgedEnd(t, judge.judge(one.parts), told.get(t.index))
         for t, one in sorted(said.items(), key=lambda pair: abs(pair[1].cost - middle))
     ]
     write_judged(ends[0].trajectory.episodes, {e.trajectory.index: e.outcome for e in ends})

@@ -28,7 +28,7 @@ PER_PAGE = 100  # trajectories
 _MOST_POINTS = 600  # of a curve in a page; a longer one is drawn by evenly spaced frames
 _FILES = Path(__file__).parent / "page_files"
 _WORDS = {"source": "trajectory", "object": "object", "outcome": "outcome"}
-_WHOLE = ("t_drop_50", "contact_lag", "peaks")  # metrics that count
+_DIGITS = {"t_drop_50": 0, "contact_lag": 0, "peaks": 0}  # they count; other metrics have 2
 
 
 def write_pages(
@@ -73,15 +73,9 @@ def _page(
         if any(getattr(f, key) for f in facts)
     ]
     metrics = [
-        {
-            "key": field,
-            "label": header,
-            "meaning": meaning,
-            "metric": True,
-            "digits": 0 if field in _WHOLE else 2,
-        }
-        for header, (field, meaning) in COLUMNS.items()
-        if any(getattr(m, field) is not None for f in facts for m in f.measured.values())
+        {"key": k, "label": name, "meaning": what, "metric": True, "digits": _DIGITS.get(k, 2)}
+        for name, (k, what) in COLUMNS.items()
+        if any(getattr(m, k) is not None for f in facts for m in f.measured.values())
     ]
     content = {
         "curves": names,

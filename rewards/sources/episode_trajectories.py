@@ -100,15 +100,9 @@ def open_episodes(
     if not sound:
         raise UserError(broken[0].reason)
     shortest = min(sound, key=lambda t: t.length)
-    inputs = Inputs.of(
-        shortest.source,
-        read,
-        camera,
-        sensor=next(iter(sensors), None),
-        scene=scene_of(episodes.features),
-        length=shortest.length,
-        task=next(iter(tasks)) if len(tasks) == 1 else "",
-    )
+    about = {"sensor": next(iter(sensors), None), "scene": scene_of(episodes.features)}
+    about["task"] = next(iter(tasks)) if len(tasks) == 1 else ""
+    inputs = Inputs.of(shortest.source, read, camera, length=shortest.length, **about)
     return Source(inputs, sound, broken)
 
 
