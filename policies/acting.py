@@ -156,8 +156,8 @@ class LearnedPolicy(Planner):
             batch = ObservationBatch(touch, state, images, maps)
             self._refuse_novel(batch)
             rest = self._generator, self._width, self._key_pose
-            actions = self._network.plan(batch, *rest)[0].numpy()
-            done = self._network.is_done(batch, self._key_pose)
+            plan = self._network.plan(batch, *rest)
+            actions, done = plan.actions[0].numpy(), bool(plan.done[0])
             self._done_plans = self._done_plans + 1 if done else 0
             if done and self._network.end is not None and self._network.end.stands:
                 actions[:, :-1] = 0.0

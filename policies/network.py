@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float16, UInt8
@@ -128,6 +128,13 @@ class ObservationBatch:
         return self.state[:, -1, : ft.N_JOINTS]
 
 
+class Plan(NamedTuple):
+    """Actions, and whether the task looks done."""
+
+    actions: Float[Tensor, "b h 8"]  # `features.ACTION`, from the tick of the latest observation on
+    done: Bool[Tensor, " b"]
+
+
 class PolicyNetwork(nn.Module):
     """Network from an observation batch to actions, with its normalizers inside."""
 
@@ -194,15 +201,6 @@ class PolicyNetwork(nn.Module):
         """Return the novelty of the first observation's latest touch; above 1 it is unknown."""
         return self.novelty(batch.touch[:1, -1]).item() if self.novelty else 0.0
 
-    @torch.inference_mode()
-    def is_done(self, batch: ObservationBatch, average: KeyPoseAverage) -> bool:
-        """Return whether the first observation looks like the task's end, by the plan's `average`."""
-        if self.end is None:
-            return False
-        pose = average.latest if self.key_pose else None
-        found = self.end(self._encode(batch, self._encode_touch(batch), pose))
-        return bool(found[0] > self.end.limit)
-
     def condition(
         self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"] | None = None
     ) -> Float[Tensor, "b c"]:
@@ -262,8 +260,8 @@ class PolicyNetwork(nn.Module):
         width: float | None = None,
         average: KeyPoseAverage | None = None,
         key_pose: Float[Tensor, "b 3 8"] | None = None,
-    ) -> Float[Tensor, "b h 8"]:
-        """Return actions (`features.ACTION`) of the ticks from the latest observation on.
+    ) -> Plan:
+        """Return a plan for each observation.
 
         The same generator state (on the CPU) gives the same plan. With cameras the gripper keeps `width`
         (m), the last plan's, until the hand is at the next key pose; this needs the `average` of the
@@ -286,7 +284,8 @@ class PolicyNetwork(nn.Module):
                 tcp = torch.stack([self._hand(state)[:, :7] for state in batch.state.unbind(1)], 1)
                 planned = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)
                 actions[..., -1] = width if keeps else planned
-        return actions
+        never = torch.zeros(len(actions), dtype=torch.bool)
+        return Plan(actions, never if self.end is None else self.end(encoded) > self.end.limit)
 
     def _true_pose(
         self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]

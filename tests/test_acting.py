@@ -47,7 +47,7 @@ def test_an_actor_does_its_plans_in_order_and_on_time(plan_ticks: int) -> None:
         batch = ObservationBatch(
             torch.from_numpy(rows[seen])[None], torch.from_numpy(states[seen])[None]
         )
-        plan = policy.plan(batch, generator)[0].numpy()
+        plan = policy.plan(batch, generator).actions[0].numpy()
         first = plan_ticks if expected else 0
         expected += list(plan[first : first + 3])
     np.testing.assert_allclose(done, expected[:8], rtol=1e-5)

@@ -252,7 +252,7 @@ def test_the_gripper_changes_where_the_hand_rests_at_a_key_pose_and_no_velocity_
 
     def plan(width: float | None) -> torch.Tensor:
         generator = torch.Generator().manual_seed(0)
-        return network.plan(batch, generator, width, KeyPoseAverage(0.3))
+        return network.plan(batch, generator, width, KeyPoseAverage(0.3)).actions
 
     def widths(width: float | None) -> torch.Tensor:
         return plan(width)[..., -1]

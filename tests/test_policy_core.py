@@ -113,13 +113,13 @@ def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    plan = policy.plan(condition, torch_rng(3))
+    plan = policy.plan(condition, torch_rng(3)).actions
     assert plan.shape == actions.shape
     done = ~windows.action_is_pad
     error, spread = (plan - actions)[done], (actions - actions[done].mean(0))[done]
     assert error.square().mean() < 0.1 * spread.square().mean()
     assert (plan[..., 7] == 0).all()
-    assert torch.equal(plan, policy.plan(condition, torch_rng(3)))
+    assert torch.equal(plan, policy.plan(condition, torch_rng(3)).actions)
 
 
 CONFIG = TrainConfig(epochs=3, batch_size=8, lr=1e-3, snapshot_epochs=2)
@@ -162,7 +162,8 @@ def test_a_saved_policy_plans_the_same(tmp_path: Path, head: DiffusionConfig | M
     loaded = checkpoint.load(tmp_path)
     assert loaded.config == config
     condition, _ = windows.take(torch.arange(3))
-    assert torch.equal(loaded.plan(condition, torch_rng()), policy.plan(condition, torch_rng()))
+    plans = [p.plan(condition, torch_rng()).actions for p in (loaded, policy)]
+    assert torch.equal(*plans)
 
 
 def test_a_hand_that_only_opens_and_closes_is_sent_nothing_in_between(tmp_path: Path) -> None:
@@ -174,7 +175,7 @@ def test_a_hand_that_only_opens_and_closes_is_sent_nothing_in_between(tmp_path: 
     train(config, windows, windows, CONFIG, tmp_path, SEED, {})
     policy = checkpoint.load(tmp_path / "policy")
     condition, _ = windows.take(torch.arange(8))
-    widths = policy.plan(condition, torch_rng())[..., 7]
+    widths = policy.plan(condition, torch_rng()).actions[..., 7]
     assert set(widths.unique().tolist()) <= set(policy.config.gripper_widths)
     assert sorted(policy.config.gripper_widths) == pytest.approx([0.0, 0.08])
 

@@ -257,7 +257,7 @@ def _open_loop(
 
 def _sampled(policy: PolicyNetwork) -> Plan:
     generator = torch.Generator().manual_seed(0)
-    return lambda batch: policy.plan(batch, generator)
+    return lambda batch: policy.plan(batch, generator).actions
 
 
 def _with_shuffled_touch(policy: PolicyNetwork, recorded_touch: torch.Tensor) -> Plan:

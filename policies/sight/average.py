@@ -30,7 +30,6 @@ class KeyPoseAverage:
         self._left: Float[Tensor, "1 7"] | None = None  # the same, once the fingers have moved
         self._weight = torch.zeros(COUNT, len(GROUPS))
         self._mean = torch.zeros(COUNT, ESTIMATE_DIM + 1)
-        self.latest = torch.empty(0, 11)  # what `add` last returned
 
     @property
     def gripper_moves(self) -> bool:
@@ -62,5 +61,4 @@ class KeyPoseAverage:
             self._mean, self._left = self._mean[[1, 1]], self._changed
             self._weight = torch.stack([self._weight[1], torch.zeros(len(GROUPS))])
         self._moving, self._tcp = max(self._moving - 1, 0), tcp
-        self.latest = torch.cat([likeliest(found), closes, near], 1)
-        return self.latest
+        return torch.cat([likeliest(found), closes, near], 1)

@@ -10,7 +10,8 @@ from touchgoal.policies.heads.end import EndOutput
 from touchgoal.policies.network import PolicyNetwork
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
-_STEPS, _BATCH, _RATE, _DECAY, _NOISE = 1500, 512, 1e-3, 1e-2, 0.1
+_STEPS, _PASSES, _BATCH = 1500, 100, 512  # steps and passes over the data at most
+_RATE, _DECAY, _NOISE = 1e-3, 1e-2, 0.1
 _ROWS = 1024  # windows that are encoded at once
 _LASTING = 0.3  # s for which a probability must last; recordings stop soon after the end
 _EARLY = 1.0  # s before a recording's end at which it is not done
@@ -35,7 +36,7 @@ def fit_end(
     end.scale.copy_(condition.std(0).clamp(min=1e-6))
     inputs, generator = end.scaled(condition), torch.Generator().manual_seed(seed)
     optimiser = torch.optim.AdamW(end.parameters(), _RATE, weight_decay=_DECAY)
-    for _ in range(_STEPS):
+    for _ in range(min(_STEPS, _PASSES * -(-len(inputs) // _BATCH))):
         rows = torch.randint(len(inputs), (min(_BATCH, len(inputs)),), generator=generator)
         noise = _NOISE * torch.randn(len(rows), inputs.shape[1], generator=generator)
         found = end.network(inputs[rows] + noise)[:, 0]

@@ -169,7 +169,7 @@ def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dic
     batch = _validation_batch(policy, windows)
     generator = torch.Generator().manual_seed(seed)
     observed = _observed(batch)
-    planned = policy.plan(observed, generator, key_pose=batch["key_pose"])
+    planned = policy.plan(observed, generator, key_pose=batch["key_pose"]).actions
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
     error = off.sum(1).norm(dim=1).mean()
