@@ -56,9 +56,8 @@ def deploying(twin: RunningTwin, out: Path) -> "subprocess.Popen[str]":
 @pytest.mark.slow
 def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
     pytest.importorskip("franky", reason=FRANKY.install)
-    cell = ["--lock-step", "--task", "bead-maze", "--env.wires", "helix-3"]
-    small = ["--env.cameras", "front", "--env.camera-size", "128", "128"]
-    with closing(RunningTwin([*cell, *small], tmp_path, 3)) as twin:
+    cell = ["--lock-step", "--task", "bead-maze", "--env.wires", "helix-3", "--env.cameras"]
+    with closing(RunningTwin(cell, tmp_path, 3)) as twin:
         _, complaint = deploying(twin, tmp_path).communicate(timeout=_PATIENCE)
         worst = twin.ask("truth")["worst"]
     assert complaint == "" and worst["excess"] == 0 and worst["speed"] < 1
