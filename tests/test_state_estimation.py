@@ -17,6 +17,7 @@ from touchgoal.episodes.schema import CORRECTED
 from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import PoseEstimatorConfig, PoseTrainConfig
+from touchgoal.policies.perception.known_names import NAMES
 from touchgoal.policies.perception.placements import Placements, Variety, render_placements
 from touchgoal.policies.perception.pose_estimator import Look, PoseEstimator
 from touchgoal.policies.perception.pose_training import pose_errors, train_pose_estimator
@@ -218,3 +219,28 @@ def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:
         np.testing.assert_allclose(episode.frames[ft.ACTION][tick], answer, atol=1e-6)
         assert not np.allclose(action, answer)
         observation, *_ = env.step(action)
+
+
+def test_a_name_that_fits_nothing_is_refused_with_what_is_seen() -> None:
+    """Six scenes of three objects by all names of the catalogue: those that are there, and the others."""
+    network = load_pose_estimator(SHIPPED_POLICIES["pick-place"] / ESTIMATOR)
+    options = {"tactile": False, "cameras": ("front",), "camera_size": (256, 256)}
+    env = PickPlace(PickPlaceConfig(**options, distractors=2))
+    gels = dict.fromkeys(ft.TACTILE, np.zeros((8, 8, 3), np.uint8))
+    taken, refused, told, first = [], [], [], {}
+    for seed in range(6):
+        first = env.reset(seed=seed)[0] | gels
+        there = {body.kind.name.replace("_", " ") for body in env.bodies}
+        for name in NAMES:
+            why = ""
+            try:
+                StateEstimator(network, f"the {name}").estimate(first, first)
+            except RefusedError as error:
+                why = str(error)
+            (taken if name in there else refused).append((why == "") == (name in there))
+            told += [n in why for n in there] if "looks like" in why else []
+    assert np.mean(taken) > 0.9 and np.mean(refused) > 0.7 and np.mean(told) > 0.7
+    with pytest.raises(RefusedError, match="may be what is meant: it sees .*: name one"):
+        StateEstimator(network).estimate(first, first)
+    with pytest.raises(UserError, match="hardly notices 'not'"):
+        StateEstimator(network, "not the red one")

@@ -18,6 +18,7 @@ from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.policies.acting import one_thread
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES
+from touchgoal.policies.perception.known_names import NAMES
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_pose_estimator
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
@@ -57,7 +58,7 @@ class _Change:
     env: dict[str, Any]
     scene: Callable[[Spec], None] | None = None
     image: Callable[[np.ndarray], np.ndarray] | None = None
-    target: str = ""
+    target: str = ""  # {object}: name of the object meant; {absent}: of one that is not there
     nothing: bool = False  # whether nothing can be right, so that only a refusal is
 
 
@@ -136,7 +137,11 @@ CHANGES = {
     "upper half covered": _Change({}, image=_half_covered, nothing=True),
     "mirrored": _Change({}, image=lambda image: np.ascontiguousarray(image[:, ::-1]), nothing=True),
     "two others, no name": _Change({"distractors": 2}, nothing=True),
-    "two others, a name that is not there": _Change(
+    "two others, the object's name": _Change({"distractors": 2}, target="the {object}"),
+    "two others, another object's name": _Change(
+        {"distractors": 2}, target="the {absent}", nothing=True
+    ),
+    "two others, an unknown name": _Change(
         {"distractors": 2}, target="the green teapot", nothing=True
     ),
 }
@@ -189,7 +194,12 @@ def _look(config: Config, name: str) -> list[tuple[float, float] | None]:
         image = first[ft.FRONT]
         first = {**first, ft.FRONT: image if change.image is None else change.image(image)}
         first |= dict.fromkeys(ft.TACTILE, np.zeros((8, 8, 3), np.uint8))
-        estimator = StateEstimator(network, change.target, env.calibrated_camera())
+        there = [body.kind.name for body in env.bodies]
+        absent = next(
+            n for n in NAMES[seed % len(NAMES) :] + NAMES if n.replace(" ", "_") not in there
+        )
+        target = change.target.format(object=there[0].replace("_", " "), absent=absent)
+        estimator = StateEstimator(network, target, env.calibrated_camera())
         try:
             with one_thread():
                 found = estimator.estimate(first, first)[ft.TRUTH_START]

@@ -16,6 +16,7 @@ from touchgoal.control import features as ft
 from touchgoal.policies.actions import Normalizer
 from touchgoal.policies.config import Box, PoseEstimatorConfig
 from touchgoal.policies.heads.mlp import readout
+from touchgoal.policies.perception.known_names import KnownNames, embedded_names
 from touchgoal.policies.perception.target_words import WORDS_WIDTH
 
 _START = ft.FEATURES[ft.TRUTH_START].shape[0]
@@ -80,6 +81,7 @@ class PoseEstimator(nn.Module):
         self.tcp_normalizer, self.start_normalizer = Normalizer((_TCP,)), Normalizer((_START,))
         self.heads = nn.ModuleList(readout(width, config.width, part) for part in _PARTS)
         self.unmirrored = readout(seen, config.width // 4, 1)
+        self.known = KnownNames(config.finder_channels)
 
     def forward(
         self,
@@ -128,6 +130,31 @@ class PoseEstimator(nn.Module):
         surest, second = (torch.stack([f[i] for f in found.values()]).amax(0) for i in (1, 2))
         turned, unmirrored = start[:, 3:5].norm(dim=1), self.unmirrored(scene)[:, 0].sigmoid()
         return Look(start, surest, turned, unmirrored, places, second)
+
+    def lack(self, lit: Images, words: Float[Tensor, "b d"]) -> Float[Tensor, " b"]:
+        """Return by how much the words fit the likeliest object less than its likeliest name does."""
+        asked, names, maps = self._named(lit, words)
+        return self.known.lack(asked, names, maps)
+
+    def seen(self, lit: Images) -> list[str]:
+        """Return names of the objects in the first of some evenly lit images, the surest first."""
+        _, names, maps = self._named(lit, torch.zeros(1, WORDS_WIDTH))
+        return self.known.seen(names, maps[0], _centres(self.config.crops[0][1]).flatten(0, 1))
+
+    def _named(
+        self, lit: Images, words: Float[Tensor, "b d"]
+    ) -> tuple[Float[Tensor, "b c"], Float[Tensor, "v c"], Float[Tensor, "b c cells"]]:
+        """Return the first camera's queries for the words and for all names, and its maps."""
+        finder, (camera, _) = cast(_Finder, self.finders[0]), self.config.crops[0]
+        asked, names = (finder.asks(w)[:, 0] for w in (words, embedded_names()))
+        return asked, names, finder.maps(lit[camera]).flatten(2)
+
+    def object_keys(self, lit: Images, pixels: Float[Tensor, "b k 2"]) -> Float[Tensor, "b k c"]:
+        """Return the first camera's keys of the cells at these pixels (row, column)."""
+        camera, box = self.config.crops[0]
+        maps = cast(_Finder, self.finders[0]).maps(lit[camera]).flatten(2)
+        cells = torch.cdist(pixels, _centres(box).flatten(0, 1).to(pixels)).argmin(2)
+        return maps.mT[torch.arange(len(maps))[:, None], cells]
 
     def scores(
         self, images: Images, words: Float[Tensor, "b d"]
@@ -204,12 +231,18 @@ class _Finder(nn.Module):
     def forward(
         self, images: UInt8[Tensor, "b h w 3"], words: Float[Tensor, "b d"]
     ) -> Float[Tensor, "b 2 y x"]:
+        return torch.einsum("bqc,bcyx->bqyx", self.asks(words), self.maps(images))
+
+    def maps(self, images: UInt8[Tensor, "b h w 3"]) -> Float[Tensor, "b c y x"]:
+        """Return the key of each cell."""
         top, bottom, left, right = self.box
         maps = self.patches(_pixels(images[:, top:bottom, left:right]))
-        maps = self.keys(F.relu(self.surroundings(self.cells(F.relu(maps)))))
-        queries = self.queries.expand(len(maps), -1, -1)
-        queries = queries + torch.stack([self.words(words), torch.zeros_like(queries[:, 1])], 1)
-        return torch.einsum("bqc,bcyx->bqyx", queries, maps)
+        return self.keys(F.relu(self.surroundings(self.cells(F.relu(maps)))))
+
+    def asks(self, words: Float[Tensor, "b d"]) -> Float[Tensor, "b 2 c"]:
+        """Return the queries of the object in words, and of the goal."""
+        queries = self.queries.expand(len(words), -1, -1)
+        return queries + torch.stack([self.words(words), torch.zeros_like(queries[:, 1])], 1)
 
 
 def _centres(box: Box) -> Float[Tensor, "y x 2"]:

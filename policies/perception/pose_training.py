@@ -172,31 +172,37 @@ def _add_pixel_noise(
 def fit_trust(
     estimator: PoseEstimator, placements: Placements
 ) -> tuple[PoseEstimatorConfig, dict[str, float]]:
-    """Return the config with `sure` and `second`, and the shares of good and of bad estimates refused.
+    """Return the config with `sure`, `second` and `lack`, and the shares of good and bad estimates refused.
 
     Each number of `sure` refuses a quarter of the 2 % of good estimates that it may refuse, `second` 2 % of
-    those without a sentence; a bad one is off by 2 cm or 20 degrees. Only objects that a sentence
-    identifies, or that stand alone, count.
+    those without a sentence, `lack` of those with one; a bad one is off by 2 cm or 20 degrees. Only objects
+    that a sentence identifies, or that stand alone, count. The estimator's known objects are fitted, too.
     """
-    sure, good, second, named = [], [], [], []
+    estimator.known.fit(_object_keys(estimator, placements))
+    sure, good, second, lacks, named = [], [], [], [], []
     for rows, target, words in _targets(placements):
-        start, sureness, others = _look(estimator, placements, rows, words)
+        start, sureness, others, lack = _look(estimator, placements, rows, words)
         true = placements.start[rows, target]
         sure.append(sureness)
         second.append(others[:, 0])
+        lacks.append(lack)
         named.append(words.any(1))
         off = (start - true)[:, :2].norm(dim=1)
         good.append((off < _BAD[0]) & (_yaw_error(start, true) < _BAD[1]))
     shares, fine = torch.cat(sure), torch.cat(good)
-    others, said = torch.cat(second), torch.cat(named)
+    others, lack, said = torch.cat(second), torch.cat(lacks), torch.cat(named)
     if not (fine & ~said).any():  # without good estimates, no threshold
         return estimator.config, {"good": 0.0, "bad": 0.0}
     least = shares[fine].quantile(_FALSE_REFUSALS / shares.shape[1], dim=0)
     most = others[fine & ~said].quantile(1 - _FALSE_REFUSALS)
     refused = (shares < least).any(1) | ((others > most) & ~said)
+    config = replace(estimator.config, sure=(*least.tolist(),), second=most.item())
+    if (fine & said).any():
+        config = replace(config, lack=lack[fine & said].quantile(1 - _FALSE_REFUSALS).item())
+        refused |= (lack > config.lack) & said
     known = {"good": refused[fine].float().mean().item()}
     known["bad"] = refused[~fine].sum().item() / max(int((~fine).sum()), 1)
-    return replace(estimator.config, sure=(*least.tolist(),), second=most.item()), known
+    return config, known
 
 
 @torch.no_grad()
@@ -209,7 +215,7 @@ def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, d
     """
     errors = {}
     for rows, target, words in _targets(placements):
-        predicted, _, _ = _look(estimator, placements, rows, words)
+        predicted = _look(estimator, placements, rows, words)[0]
         true = placements.start[rows, target]
         off = predicted - true
         away = 1e3 * off[:, :2].norm(dim=1)
@@ -249,21 +255,34 @@ def _targets(
             yield rows, target, words
 
 
+def _object_keys(estimator: PoseEstimator, placements: Placements) -> Float[Tensor, "m c"]:
+    """Return the key of every object, see `PoseEstimator.object_keys`."""
+    (camera, _), keys = estimator.config.crops[0], []
+    for rows in torch.arange(len(placements)).split(_BATCH):
+        lit, pixels = (
+            evenly_lit({camera: placements.images[camera][rows]}),
+            placements.pixels[camera],
+        )
+        there = torch.arange(pixels.shape[1] - 1) < placements.objects[rows, None]
+        keys.append(estimator.object_keys(lit, pixels[rows, :-1])[there])
+    return torch.cat(keys)
+
+
 def _look(
     estimator: PoseEstimator,
     placements: Placements,
     rows: Int64[Tensor, " n"],
     words: Float[Tensor, "n d"],
-) -> tuple[Float[Tensor, "n 7"], Float[Tensor, "n 4"], Float[Tensor, "n 2"]]:
-    """Return `start`, `sureness` and `second` of each `Look`."""
+) -> tuple[Float[Tensor, "n 7"], Float[Tensor, "n 4"], Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+    """Return `start`, `sureness` and `second` of each `Look`, and its `lack`."""
     looks = []
     for some, chosen in zip(rows.split(_BATCH), words.split(_BATCH), strict=True):
         lit = evenly_lit({key: images[some] for key, images in placements.images.items()})
         scene = estimator.scene(lit, placements.tcp[some], placements.shift[some])
         look = estimator.look(lit, chosen, scene)
-        looks.append((look.start, look.sureness, look.second))
-    start, sureness, second = (torch.cat(parts) for parts in zip(*looks, strict=True))
-    return start, sureness, second
+        looks.append((look.start, look.sureness, look.second, estimator.lack(lit, chosen)))
+    start, sureness, second, lack = (torch.cat(parts) for parts in zip(*looks, strict=True))
+    return start, sureness, second, lack
 
 
 def _yaw_error(predicted: Float[Tensor, "n 7"], true: Float[Tensor, "n 7"]) -> Float[Tensor, " n"]:

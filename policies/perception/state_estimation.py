@@ -14,6 +14,7 @@ from torch import Tensor
 from touchgoal.control import features as ft
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
+from touchgoal.encoders.towers.goal_sentence import check_goal_sentence
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.config import PoseEstimatorConfig
 from touchgoal.policies.perception.pose_estimator import (
@@ -70,8 +71,10 @@ class StateEstimator:
     ) -> None:
         """Use a network for inference.
 
-        `front_camera` is where a calibrated camera stands; None if that is not known.
+        `front_camera` is where a calibrated camera stands; None if that is not known. UserError: `target`
+        says what is not meant.
         """
+        check_goal_sentence(target)
         self.pose_estimator, self.target = pose_estimator, target
         self._views: dict[str, UsualView] = {}
         if front_camera is not None:
@@ -106,26 +109,32 @@ class StateEstimator:
     @torch.inference_mode()
     def _begin(self, first: Mapping[str, np.ndarray]) -> None:
         """Begin an episode: estimate its poses, store its untouched gels."""
-        tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
+        config, tcp = self.pose_estimator.config, torch.from_numpy(first[ft.TCP_POSE])[None]
         self._check_hand(tcp)
         images = self._images(first)
         view = self._views.get(ft.FRONT)
         shift = torch.zeros(1, 3) if view is None else torch.from_numpy(view.shift[None]).float()
         self._scene = self.pose_estimator.scene(images, tcp, shift)
         look = self.pose_estimator.look(images, self._words, self._scene)
+        if self.target and self.pose_estimator.lack(images, self._words).item() > config.lack:
+            raise RefusedError(f"nothing here looks like '{self.target}': {self._seen(images)}")
         sureness = look.sureness[0].tolist()
         for (what, remedy), sure, least in zip(_ASKED.items(), sureness, self._least, strict=True):
             if sure < least:
                 raise RefusedError(
                     f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): {remedy}"
                 )
-        if not self.target and look.second[0, 0] > self.pose_estimator.config.second:
-            raise RefusedError("several objects may be what is meant: say which one (--target)")
+        if not self.target and look.second[0, 0] > config.second:
+            raise RefusedError(f"several objects may be what is meant: {self._seen(images)}")
         self._places = look.places
         self._start = self._latest = _unit_yaw(look.start[0].numpy())
         self._check_camera(look, first)
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
         self._first, self._touched = first, False
+
+    def _seen(self, images: Images) -> str:
+        names = ", ".join(self.pose_estimator.seen(images)) or "nothing that it knows"
+        return f"it sees {names}: name one (--target)"
 
     @torch.inference_mode()
     def _look_again(self, observation: Mapping[str, np.ndarray]) -> None:
