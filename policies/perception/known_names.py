@@ -39,16 +39,6 @@ class KnownNames(nn.Module):
         mean, best = scores.mean(0), scores.quantile(_BEST, dim=0)
         return (keys @ queries.mT - mean) / (best - mean).clamp(min=1e-6)
 
-    def lack(
-        self,
-        asked: Float[Tensor, "b c"],
-        names: Float[Tensor, "v c"],
-        maps: Float[Tensor, "b c cells"],
-    ) -> Float[Tensor, " b"]:
-        """Return by how much a sentence fits the object that it fits best less than the likeliest name."""
-        keys = _at_best(asked, maps)
-        return self.marks(names, keys).amax(1) - self.marks(asked, keys).diagonal()
-
     def seen(
         self,
         names: Float[Tensor, "v c"],
@@ -65,14 +55,6 @@ class KnownNames(nn.Module):
             if mark[i] > _SEEN and apart:
                 found.append((place, NAMES[name[i]]))
         return list(dict.fromkeys(name for _, name in found))
-
-
-def _at_best(
-    queries: Float[Tensor, "b c"], maps: Float[Tensor, "b c cells"]
-) -> Float[Tensor, "b c"]:
-    """Return the key of the cell that each query fits best in its image."""
-    cells = torch.einsum("bc,bcp->bp", queries, maps).argmax(1)
-    return maps[torch.arange(len(maps)), :, cells]
 
 
 @cache

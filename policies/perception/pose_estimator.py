@@ -131,30 +131,33 @@ class PoseEstimator(nn.Module):
         turned, unmirrored = start[:, 3:5].norm(dim=1), self.unmirrored(scene)[:, 0].sigmoid()
         return Look(start, surest, turned, unmirrored, places, second)
 
-    def lack(self, lit: Images, words: Float[Tensor, "b d"]) -> Float[Tensor, " b"]:
-        """Return by how much the words fit the likeliest object less than its likeliest name does."""
-        asked, names, maps = self._named(lit, words)
-        return self.known.lack(asked, names, maps)
+    def likeliest(
+        self, lit: Images, words: Float[Tensor, "b d"]
+    ) -> tuple[Float[Tensor, "b c"], Float[Tensor, "b c"]]:
+        """Return the first camera's query for the words, and the key of the cell that fits them best."""
+        asked, maps = self._finder.asks(words)[:, 0], self._maps(lit)
+        cells = torch.einsum("bc,bcp->bp", asked, maps).argmax(1)
+        return asked, maps[torch.arange(len(maps)), :, cells]
+
+    def lack(self, asked: Float[Tensor, "b c"], keys: Float[Tensor, "b c"]) -> Float[Tensor, " b"]:
+        """Return by how much words fit what is `likeliest` less than its likeliest name does."""
+        names = self.known.marks(self._names(), keys).amax(1)
+        return names - self.known.marks(asked, keys).diagonal()
 
     def seen(self, lit: Images) -> list[str]:
         """Return names of the objects in the first of some evenly lit images, the surest first."""
-        _, names, maps = self._named(lit, torch.zeros(1, WORDS_WIDTH))
-        return self.known.seen(names, maps[0], _centres(self.config.crops[0][1]).flatten(0, 1))
+        centres = _centres(self.config.crops[0][1]).flatten(0, 1)
+        return self.known.seen(self._names(), self._maps(lit)[0], centres)
 
-    def _named(
-        self, lit: Images, words: Float[Tensor, "b d"]
-    ) -> tuple[Float[Tensor, "b c"], Float[Tensor, "v c"], Float[Tensor, "b c cells"]]:
-        """Return the first camera's queries for the words and for all names, and its maps."""
-        finder, (camera, _) = cast(_Finder, self.finders[0]), self.config.crops[0]
-        asked, names = (finder.asks(w)[:, 0] for w in (words, embedded_names()))
-        return asked, names, finder.maps(lit[camera]).flatten(2)
+    @property
+    def _finder(self) -> "_Finder":
+        return cast(_Finder, self.finders[0])
 
-    def object_keys(self, lit: Images, pixels: Float[Tensor, "b k 2"]) -> Float[Tensor, "b k c"]:
-        """Return the first camera's keys of the cells at these pixels (row, column)."""
-        camera, box = self.config.crops[0]
-        maps = cast(_Finder, self.finders[0]).maps(lit[camera]).flatten(2)
-        cells = torch.cdist(pixels, _centres(box).flatten(0, 1).to(pixels)).argmin(2)
-        return maps.mT[torch.arange(len(maps))[:, None], cells]
+    def _names(self) -> Float[Tensor, "v c"]:
+        return self._finder.asks(embedded_names())[:, 0]
+
+    def _maps(self, lit: Images) -> Float[Tensor, "b c cells"]:
+        return self._finder.maps(lit[self.config.crops[0][0]]).flatten(2)
 
     def scores(
         self, images: Images, words: Float[Tensor, "b d"]

@@ -178,19 +178,19 @@ def fit_trust(
     those without a sentence, `lack` of those with one; a bad one is off by 2 cm or 20 degrees. Only objects
     that a sentence identifies, or that stand alone, count. The estimator's known objects are fitted, too.
     """
-    estimator.known.fit(_object_keys(estimator, placements))
-    sure, good, second, lacks, named = [], [], [], [], []
+    sure, good, second, named, asked, keys = ([] for _ in range(6))
     for rows, target, words in _targets(placements):
-        start, sureness, others, lack = _look(estimator, placements, rows, words)
+        start, sureness, others, *likeliest = _look(estimator, placements, rows, words)
         true = placements.start[rows, target]
         sure.append(sureness)
         second.append(others[:, 0])
-        lacks.append(lack)
         named.append(words.any(1))
+        asked.append(likeliest[0])
+        keys.append(likeliest[1])
         off = (start - true)[:, :2].norm(dim=1)
         good.append((off < _BAD[0]) & (_yaw_error(start, true) < _BAD[1]))
     shares, fine = torch.cat(sure), torch.cat(good)
-    others, lack, said = torch.cat(second), torch.cat(lacks), torch.cat(named)
+    others, said, objects = torch.cat(second), torch.cat(named), torch.cat(keys)
     if not (fine & ~said).any():  # without good estimates, no threshold
         return estimator.config, {"good": 0.0, "bad": 0.0}
     least = shares[fine].quantile(_FALSE_REFUSALS / shares.shape[1], dim=0)
@@ -198,6 +198,8 @@ def fit_trust(
     refused = (shares < least).any(1) | ((others > most) & ~said)
     config = replace(estimator.config, sure=(*least.tolist(),), second=most.item())
     if (fine & said).any():
+        estimator.known.fit(objects[fine])
+        lack = estimator.lack(torch.cat(asked), objects)
         config = replace(config, lack=lack[fine & said].quantile(1 - _FALSE_REFUSALS).item())
         refused |= (lack > config.lack) & said
     known = {"good": refused[fine].float().mean().item()}
@@ -255,34 +257,20 @@ def _targets(
             yield rows, target, words
 
 
-def _object_keys(estimator: PoseEstimator, placements: Placements) -> Float[Tensor, "m c"]:
-    """Return the key of every object, see `PoseEstimator.object_keys`."""
-    (camera, _), keys = estimator.config.crops[0], []
-    for rows in torch.arange(len(placements)).split(_BATCH):
-        lit, pixels = (
-            evenly_lit({camera: placements.images[camera][rows]}),
-            placements.pixels[camera],
-        )
-        there = torch.arange(pixels.shape[1] - 1) < placements.objects[rows, None]
-        keys.append(estimator.object_keys(lit, pixels[rows, :-1])[there])
-    return torch.cat(keys)
-
-
 def _look(
     estimator: PoseEstimator,
     placements: Placements,
     rows: Int64[Tensor, " n"],
     words: Float[Tensor, "n d"],
-) -> tuple[Float[Tensor, "n 7"], Float[Tensor, "n 4"], Float[Tensor, "n 2"], Float[Tensor, " n"]]:
-    """Return `start`, `sureness` and `second` of each `Look`, and its `lack`."""
+) -> tuple[Float[Tensor, "n _"], ...]:
+    """Return start, sureness and second places of each `Look`, and what is `likeliest`."""
     looks = []
     for some, chosen in zip(rows.split(_BATCH), words.split(_BATCH), strict=True):
         lit = evenly_lit({key: images[some] for key, images in placements.images.items()})
         scene = estimator.scene(lit, placements.tcp[some], placements.shift[some])
-        look = estimator.look(lit, chosen, scene)
-        looks.append((look.start, look.sureness, look.second, estimator.lack(lit, chosen)))
-    start, sureness, second, lack = (torch.cat(parts) for parts in zip(*looks, strict=True))
-    return start, sureness, second, lack
+        look, likeliest = estimator.look(lit, chosen, scene), estimator.likeliest(lit, chosen)
+        looks.append((look.start, look.sureness, look.second, *likeliest))
+    return tuple(torch.cat(parts) for parts in zip(*looks, strict=True))
 
 
 def _yaw_error(predicted: Float[Tensor, "n 7"], true: Float[Tensor, "n 7"]) -> Float[Tensor, " n"]:

@@ -116,7 +116,8 @@ class StateEstimator:
         shift = torch.zeros(1, 3) if view is None else torch.from_numpy(view.shift[None]).float()
         self._scene = self.pose_estimator.scene(images, tcp, shift)
         look = self.pose_estimator.look(images, self._words, self._scene)
-        if self.target and self.pose_estimator.lack(images, self._words).item() > config.lack:
+        likeliest = self.pose_estimator.likeliest(images, self._words)
+        if self.target and self.pose_estimator.lack(*likeliest).item() > config.lack:
             raise RefusedError(f"nothing here looks like '{self.target}': {self._seen(images)}")
         sureness = look.sureness[0].tolist()
         for (what, remedy), sure, least in zip(_ASKED.items(), sureness, self._least, strict=True):
