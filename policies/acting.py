@@ -146,10 +146,10 @@ class LearnedPolicy(Planner):
 
         In an episode's first call the oldest observation is the untouched first one.
         """
+        self.embed(history)
         if self._learned_estimator and (other := self._second_try(history[-1])) is not None:
             return other
         with one_thread():
-            self.embed(history)
             _, touch, state = zip(*self._embedded, strict=True)
             touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (touch, state))
             images, maps = self._difference_images(history[-1]), self._feature_maps(history[-1])
@@ -174,9 +174,11 @@ class LearnedPolicy(Planner):
             return actions
 
     def _second_try(self, observation: Observation) -> Float32[np.ndarray, "h 8"] | None:
-        """Return the way back after the hand has closed on nothing; None: the policy acts."""
-        first, ticks = self._first or observation, self.config.prediction_horizon
-        what = self._regrasp.next(observation, first, self._width, self.execution_horizon)
+        """Return the way back after the hand has closed on nothing or lost it; None: the policy acts."""
+        assert self._learned_estimator is not None
+        first, ticks = self._first, self.config.prediction_horizon
+        last = self._learned_estimator.touches, self._width, self.execution_horizon
+        what = self._regrasp.next(observation, first, *last)
         if what == "look again":
             self._begin(observation)
             try:

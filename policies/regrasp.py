@@ -1,4 +1,4 @@
-"""A second try: after the hand has closed on nothing it opens and goes back to where it began."""
+"""A second try: a hand that closed on nothing, or lost its object, opens and goes back to where it began."""
 
 from typing import Literal
 
@@ -32,7 +32,12 @@ class Regrasp:
         self._width = 0.0  # m, at the last plan; of an object once it is held
 
     def next(
-        self, observation: Observation, first: Observation, wanted: float | None, ticks: int
+        self,
+        observation: Observation,
+        first: Observation,
+        touches: bool,
+        wanted: float | None,
+        ticks: int,
     ) -> Literal["act", "back", "look again"]:
         """Return what the next plan is for; `wanted` (m) is the hand's width for the last `ticks`."""
         if self.given_up:
@@ -43,7 +48,7 @@ class Regrasp:
                 return "back"
             self._goes_back = False
             return "look again"
-        if not self._is_empty(float(width), wanted, ticks):
+        if not self._is_empty(float(width), touches, wanted, ticks):
             return "act"
         self._empty_ticks, self._held_ticks = 0, 0
         self._misses, self._goes_back = self._misses + 1, True
@@ -51,14 +56,14 @@ class Regrasp:
             self.give_up("the object is not where the camera sees it, or slips away")
         return "back"
 
-    def _is_empty(self, width: float, wanted: float | None, ticks: int) -> bool:
-        """Return whether the fingers have met, or close in on what they held."""
+    def _is_empty(self, width: float, touches: bool, wanted: float | None, ticks: int) -> bool:
+        """Return whether the fingers have met, or close in on what they held, or feel it no more."""
         needed = _CONFIRMING * self._hz
         self._empty_ticks = self._empty_ticks + ticks if width < _EMPTY else 0
         held, closing = self._held_ticks >= needed, wanted is not None and wanted < width - _STILL
-        if held and closing and width < self._width - _CLOSED_IN:
+        if held and closing and (not touches or width < self._width - _CLOSED_IN):
             return True
-        still = closing and abs(width - self._width) < _STILL
+        still = closing and touches and abs(width - self._width) < _STILL
         if not held:
             self._held_ticks, self._width = (self._held_ticks + ticks if still else 0), width
         elif not closing:

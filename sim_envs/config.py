@@ -229,7 +229,7 @@ class PickPlaceConfig(EnvConfig):
     size_factor: Annotated[Positive, FIXED] = 1.0  # of the objects
     friction_factor: Annotated[Positive, FIXED] = 1.0  # of the objects
     nudge: Annotated[NotNegative, FIXED] = 0.0  # m by which the object moves after a second
-    # taken: it is gone once the hand is over it; knocked: 7 cm aside once it is lifted by 5 cm
+    # taken: it is gone once the hand is over it; knocked: on the table, 7 cm aside, once it is lifted by 5 cm
     interference: Annotated[Literal["", "taken", "knocked"], FIXED] = ""
     release: bool = False
     """Success also requires that the hand lets go. The paper's reward curves end in touch, so by

@@ -18,7 +18,7 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE, find_object, sample_body
 Hand = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, " j"]]
 """Joints (rad) of an arm for objects at these positions on the table (m, base frame)."""
 WORKSPACE = ((0.40, 0.60), (-0.20, 0.20))  # m, where objects start and goals lie, base frame
-_GONE = 0.5, 0.9  # m, a place beside the table
+_GONE, _ABOVE = (0.5, 0.9), 2e-3  # m: a place beside the table; over the table, to fall from
 _LIFTED = 0.03  # m above rest that counts as picked up
 _MOST_MISSES = 200  # draws too near to another place, after which all places are drawn again
 _APART = 0.12  # m at least between objects, and between start and goal
@@ -150,7 +150,7 @@ class PickPlace(FrankaTactileEnv):
             self._interfere(self.config.interference == "taken")
 
     def _interfere(self, taken: bool) -> None:
-        """Take the object away, or knock it out of the hand, once the time has come."""
+        """Take the object away, or knock it out of the hand onto the table, once the time has come."""
         joint, (hand, _) = self.data.joint("object"), self.kinematics.forward(self.command)
         over = np.linalg.norm(hand[:2] - joint.qpos[:2]) < 0.02 and hand[2] < 0.07
         lifted = joint.qpos[2] > self.start[2] + 0.05
@@ -159,6 +159,7 @@ class PickPlace(FrankaTactileEnv):
         angle, self._interfered = self.np_random.uniform(-np.pi, np.pi), True
         aside = joint.qpos[:2] + 0.07 * np.array([np.cos(angle), np.sin(angle)])
         joint.qpos[:2] = _GONE if taken else np.clip(aside, *np.array(WORKSPACE).T)
+        joint.qpos[2] = self.bodies[0].rest_height + _ABOVE  # at the hand's height it may be in a finger
         joint.qvel[:] = 0
 
     def _let_settle(self) -> None:

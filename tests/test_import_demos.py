@@ -161,12 +161,6 @@ def imported(source: Path, **changes: object) -> EpisodeSet:
     return EpisodeSet(Path("out/episodes"))
 
 
-@pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def test_robomimic(here: Path) -> None:
     path = robomimic(here / "lift.hdf5")
     episodes = imported(path)

@@ -118,14 +118,7 @@ def test_the_same_actions_lead_to_the_same_place_in_the_environment_and_over_the
     task = PickPlaceConfig(objects=("wooden_block",), cameras=(), as_deployed=True, deployment=late)
     env = PickPlace(task)
     env.robot = able_to_press(env.robot)
-    options = [
-        "--lock-step",
-        "--no-wrench-error",
-        "--env.objects",
-        "wooden_block",
-        "--seed",
-        str(seed),
-    ]
+    options = f"--lock-step --no-wrench-error --env.objects wooden_block --seed {seed}".split()
     env.reset(seed=seed)
     actions, here, force = press(env), [], []
     for action in actions:

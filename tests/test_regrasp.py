@@ -24,7 +24,7 @@ def seen(joints: float, width: float) -> Observation:
 def test_it_goes_back_at_a_bounded_speed_and_gives_up_after_two_more_tries() -> None:
     regrasp, first, way = Regrasp(HZ), seen(0.0, 0.04), np.ones((1, 8))
     for miss in range(3):
-        said = [regrasp.next(seen(0.3, 0.001), first, 0.0, TICKS) for _ in range(3)]
+        said = [regrasp.next(seen(0.3, 0.001), first, True, 0.0, TICKS) for _ in range(3)]
         assert said == ["act", "act", "back"], "a glance at shut fingers is not enough"
         assert bool(regrasp.given_up) == (miss == 2)
         way = regrasp.way_back(seen(0.3, 0.001), first, 16)
@@ -33,19 +33,22 @@ def test_it_goes_back_at_a_bounded_speed_and_gives_up_after_two_more_tries() -> 
                 0.08
             )
             assert way[:, :-1].sum(0) == pytest.approx(-0.3, abs=1e-6)
-            assert regrasp.next(seen(0.1, 0.08), first, 0.08, TICKS) == "back"
-            assert regrasp.next(seen(0.01, 0.08), first, 0.08, TICKS) == "look again"
+            assert regrasp.next(seen(0.1, 0.08), first, True, 0.08, TICKS) == "back"
+            assert regrasp.next(seen(0.01, 0.08), first, True, 0.08, TICKS) == "look again"
     assert not way[:, :-1].any() and "3 of 3 tries" in regrasp.given_up
 
 
-@pytest.mark.parametrize(("closes_in", "said"), [(0.005, "act"), (0.012, "back")])
-def test_an_object_is_lost_once_the_fingers_close_in_on_where_it_was(
-    closes_in: float, said: str
+@pytest.mark.parametrize(
+    ("closes_in", "feels", "said"),
+    [(0.005, True, "act"), (0.012, True, "back"), (0.0, False, "back")],
+)
+def test_an_object_is_lost_once_the_fingers_close_in_on_where_it_was_or_feel_it_no_more(
+    closes_in: float, feels: bool, said: str
 ) -> None:
     regrasp, first = Regrasp(HZ), seen(0.0, 0.04)
     for width in (0.08, 0.06, 0.03, 0.03, 0.03, 0.03, 0.03):
-        assert regrasp.next(seen(0.3, width), first, 0.0, TICKS) == "act"
-    assert regrasp.next(seen(0.3, 0.03 - closes_in), first, 0.0, TICKS) == said
+        assert regrasp.next(seen(0.3, width), first, True, 0.0, TICKS) == "act"
+    assert regrasp.next(seen(0.3, 0.03 - closes_in), first, feels, 0.0, TICKS) == said
 
 
 @pytest.mark.slow

@@ -61,6 +61,7 @@ class StateEstimator:
         cameras: columns of the camera images that it reads.
         camera_size: rows and columns of these.
         target: the object in words; "" if it is the only one.
+        touches: whether a fingertip touched in the latest observation.
     """
 
     def __init__(
@@ -87,7 +88,8 @@ class StateEstimator:
         self._scene, self._places = torch.empty(1, 0), Places()
         self._start = self._latest = np.empty(0, np.float32)
         self._contact: dict[str, ContactDetector] = {}
-        self._touched, self._least = False, pose_estimator.config.sure
+        self.touches = self._touched = False
+        self._least = pose_estimator.config.sure
 
     def estimate(
         self, observation: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]
@@ -100,7 +102,8 @@ class StateEstimator:
         if self._first is not first:
             self._begin(first)
         contact = [detector.update(observation[key]) for key, detector in self._contact.items()]
-        self._touched |= any(contact)
+        self.touches = any(contact)
+        self._touched |= self.touches
         away = np.linalg.norm(observation[ft.TCP_POSE][:3] - self._start[:3])
         if not self._touched and observation is not first and away > _NEAREST:
             self._look_again(observation)
