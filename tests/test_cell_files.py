@@ -106,53 +106,42 @@ def test_a_misspelt_object_is_named_by_its_key(tmp_path: Path) -> None:
 
 
 TIPS = 'fingertips = { sensor = "digit", left = "simulated", right = "*" }'
+real, sim, tips = REAL.replace, SIM.replace, TIPS.replace
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (SIM.replace('arm = "sim"', ""), "arm is missing"),
+        (sim('arm = "sim"', ""), "arm is missing"),
         (
-            SIM.replace('"sim"', '"fr3"\naddress = "a"').replace('_hand"', '_hand", address = "a"'),
+            sim('"sim"', '"fr3"\naddress = "a"').replace('_hand"', '_hand", address = "a"'),
             "tool is missing: measure tcp, mass, centre_of_mass and finger_corners",
         ),
-        (SIM.replace("cameras.front", "cameras.back"), "cameras.back must be 'front' or 'wrist'"),
-        (SIM.replace("policy =", "polcy ="), "unknown key in task 'polcy': did you mean policy?"),
-        (SIM.replace("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),
+        (sim("cameras.front", "cameras.back"), "cameras.back must be 'front' or 'wrist'"),
+        (sim("policy =", "polcy ="), "unknown key in task 'polcy': did you mean policy?"),
+        (sim("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),
         (SIM + "safety = { force = nan }", "safety.force must be a finite number, not nan: Ext"),
         (
             SIM + 'fingertips = { sensor = "digt", left = "a", right = "b" }',
             "unknown sensor or folde",
         ),
+        (SIM + tips("*", "simulatd"), "fingertips.right is 'simulatd': did you mean 'simul"),
+        (SIM + tips("*", ""), "fingertips.right is empty: give a value or leave it out"),
+        (sim("seed = 3", 'instruction = ""'), "task.instruction is empty: give a value or"),
+        (sim("seed = 3", 'normalizer = "no"'), "task.normalizer does nothing without task.re"),
+        (real("172.16.0.2", "172.16.0.300"), "address '172.16.0.300' does not appear to be"),
         (
-            SIM + TIPS.replace("*", "simulatd"),
-            "fingertips.right is 'simulatd': did you mean 'simul",
-        ),
-        (SIM + TIPS.replace("*", ""), "fingertips.right is empty: give a value or leave it out"),
-        (SIM.replace("seed = 3", 'instruction = ""'), "task.instruction is empty: give a value or"),
-        (
-            SIM.replace("seed = 3", 'normalizer = "no"'),
-            "task.normalizer does nothing without task.re",
-        ),
-        (
-            REAL.replace("172.16.0.2", "172.16.0.300"),
-            "address '172.16.0.300' does not appear to be",
-        ),
-        (
-            REAL.replace("[640, 480]", "[480, 640]"),
+            real("[640, 480]", "[480, 640]"),
             "front.size must be width, then height: did you mean [640,",
         ),
-        (
-            REAL.replace("force = 30.0", "force = 29.9"),
-            "gripper.force must lie between 30 and 70 N",
-        ),
+        (real("force = 30.0", "force = 29.9"), "gripper.force must lie between 30 and 70 N"),
         ("arm =", "is no TOML"),
-        (SIM.replace("pick-place", "plug"), "task.policy: expert is for pick-place and bead-maze"),
-        (SIM.replace("seed = 3", r'instruction = "\u001b"'), "task.instruction has control char"),
-        (SIM.replace("seed = 3", "grasp = [0.5, 0, -0.2, 0]"), "task.grasp [0.5, 0.0, -0.2] is ou"),
+        (sim("pick-place", "plug"), "task.policy: expert is for pick-place and bead-maze"),
+        (sim("seed = 3", r'instruction = "\u001b"'), "task.instruction has control char"),
+        (sim("seed = 3", "grasp = [0.5, 0, -0.2, 0]"), "task.grasp [0.5, 0.0, -0.2] is ou"),
         (re.sub(r"0\.1(539|209)", "0.0", REAL), "tool.finger_corners span [29.0, 140.0, 0.0] mm"),
-        (REAL.replace("tcp = 0.1374", "tcp = 0.4"), "tool.finger_corners leave out the TCP"),
-        (REAL.replace("2BNKH4TQ", "2BNK9P3X"), "fingertips.left and fingertips.right are both"),
+        (real("tcp = 0.1374", "tcp = 0.4"), "tool.finger_corners leave out the TCP"),
+        (real("2BNKH4TQ", "2BNK9P3X"), "fingertips.left and fingertips.right are both"),
     ],
 )
 def test_a_bad_cell_file_is_one_line(wrong: str, message: str, tmp_path: Path) -> None:
