@@ -14,7 +14,6 @@ from torch import Tensor
 from touchgoal.control import features as ft
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
-from touchgoal.encoders.towers.goal_sentence import check_goal_sentence
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.config import PoseEstimatorConfig
 from touchgoal.policies.perception.pose_estimator import (
@@ -72,10 +71,8 @@ class StateEstimator:
     ) -> None:
         """Use a network for inference.
 
-        `front_camera` is where a calibrated camera stands; None if that is not known. UserError: `target`
-        says what is not meant.
+        `front_camera` is where a calibrated camera stands; None if that is not known.
         """
-        check_goal_sentence(target)
         self.pose_estimator, self.target = pose_estimator, target
         self._views: dict[str, UsualView] = {}
         if front_camera is not None:
