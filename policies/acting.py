@@ -108,7 +108,7 @@ class LearnedPolicy(Planner):
         self._generator = torch.Generator().manual_seed(seed)
         self.done = False
         self._begin({})
-        self._regrasp, self.given_up = Regrasp(self.control_hz), ""
+        self._regrasp, self.given_up = Regrasp(self.control_hz, self.execution_horizon), ""
         self._recent: list[Observation] = []
         self._todo: list[np.ndarray] = []  # actions of the present plan
         self._next: list[np.ndarray] = []  # actions of the plan that comes next
@@ -147,7 +147,8 @@ class LearnedPolicy(Planner):
         In an episode's first call the oldest observation is the untouched first one.
         """
         self.embed(history)
-        if self._learned_estimator and (other := self._second_try(history[-1])) is not None:
+        seen = self._learned_estimator
+        if seen and (other := self._second_try(history[-1], seen.touches)) is not None:
             return other
         with one_thread():
             _, touch, state = zip(*self._embedded, strict=True)
@@ -155,8 +156,7 @@ class LearnedPolicy(Planner):
             images, maps = self._difference_images(history[-1]), self._feature_maps(history[-1])
             batch = ObservationBatch(touch, state, images, maps)
             self._refuse_novel(batch)
-            rest = self._generator, self._width, self._key_pose
-            plan = self._network.plan(batch, *rest)
+            plan = self._network.plan(batch, self._generator, self._width, self._key_pose)
             actions, done = plan.actions[0].numpy(), bool(plan.done[0])
             self._done_plans = self._done_plans + 1 if done else 0
             if done and self._network.end is not None and self._network.end.stands:
@@ -173,12 +173,12 @@ class LearnedPolicy(Planner):
             self._width = width
             return actions
 
-    def _second_try(self, observation: Observation) -> Float32[np.ndarray, "h 8"] | None:
+    def _second_try(
+        self, observation: Observation, touches: bool
+    ) -> Float32[np.ndarray, "h 8"] | None:
         """Return the way back after the hand has closed on nothing or lost it; None: the policy acts."""
-        assert self._learned_estimator is not None
         first, ticks = self._first, self.config.prediction_horizon
-        last = self._learned_estimator.touches, self._width, self.execution_horizon
-        what = self._regrasp.next(observation, first, *last)
+        what = self._regrasp.next(observation, first, touches, self._width)
         if what == "look again":
             self._begin(observation)
             try:

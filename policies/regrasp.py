@@ -24,22 +24,17 @@ class Regrasp:
         given_up: why there is no further try; "" before.
     """
 
-    def __init__(self, hz: float) -> None:
-        """Begin an episode; control ticks come at `hz`."""
-        self.given_up, self._hz = "", hz
+    def __init__(self, hz: float, ticks: int) -> None:
+        """Begin an episode; control ticks come at `hz`, and a plan after every so many."""
+        self.given_up, self._hz, self._ticks = "", hz, ticks
         self._misses, self._goes_back = 0, False
         self._empty_ticks = self._held_ticks = 0
         self._width = 0.0  # m, at the last plan; of an object once it is held
 
     def next(
-        self,
-        observation: Observation,
-        first: Observation,
-        touches: bool,
-        wanted: float | None,
-        ticks: int,
+        self, observation: Observation, first: Observation, touches: bool, wanted: float | None
     ) -> Literal["act", "back", "look again"]:
-        """Return what the next plan is for; `wanted` (m) is the hand's width for the last `ticks`."""
+        """Return what the next plan is for; `wanted` (m) is the hand's width by the last one."""
         if self.given_up:
             return "back"
         joints, width = observation[ft.STATE][:N_JOINTS], observation[ft.STATE][-1]
@@ -48,7 +43,7 @@ class Regrasp:
                 return "back"
             self._goes_back = False
             return "look again"
-        if not self._is_empty(float(width), touches, wanted, ticks):
+        if not self._is_empty(float(width), touches, wanted):
             return "act"
         self._empty_ticks, self._held_ticks = 0, 0
         self._misses, self._goes_back = self._misses + 1, True
@@ -56,16 +51,16 @@ class Regrasp:
             self.give_up("the object is not where the camera sees it, or slips away")
         return "back"
 
-    def _is_empty(self, width: float, touches: bool, wanted: float | None, ticks: int) -> bool:
+    def _is_empty(self, width: float, touches: bool, wanted: float | None) -> bool:
         """Return whether the fingers have met, or close in on what they held, or feel it no more."""
         needed = _CONFIRMING * self._hz
-        self._empty_ticks = self._empty_ticks + ticks if width < _EMPTY else 0
+        self._empty_ticks = self._empty_ticks + self._ticks if width < _EMPTY else 0
         held, closing = self._held_ticks >= needed, wanted is not None and wanted < width - _STILL
         if held and closing and (not touches or width < self._width - _CLOSED_IN):
             return True
         still = closing and touches and abs(width - self._width) < _STILL
         if not held:
-            self._held_ticks, self._width = (self._held_ticks + ticks if still else 0), width
+            self._held_ticks, self._width = (self._held_ticks + self._ticks) * still, width
         elif not closing:
             self._held_ticks = 0
         return self._empty_ticks >= needed

@@ -108,15 +108,9 @@ class SensorRandomization:
 
 
 NO_RANDOMIZATION = SensorRandomization(
-    gain=0.0,
-    offset=0.0,
-    pattern=0.0,
-    azimuth=0.0,
-    blur=0.0,
-    pixel_pitch=False,
-    defocus=0.0,
-    markers=0.0,
-)
+    gain=0.0, offset=0.0, pattern=0.0, azimuth=0.0, blur=0.0,
+    pixel_pitch=False, defocus=0.0, markers=0.0,
+)  # fmt: skip
 
 
 CameraPlacement = tuple[float, float, float, float, float, float, float, float]

@@ -159,7 +159,9 @@ class PickPlace(FrankaTactileEnv):
         angle, self._interfered = self.np_random.uniform(-np.pi, np.pi), True
         aside = joint.qpos[:2] + 0.07 * np.array([np.cos(angle), np.sin(angle)])
         joint.qpos[:2] = _GONE if taken else np.clip(aside, *np.array(WORKSPACE).T)
-        joint.qpos[2] = self.bodies[0].rest_height + _ABOVE  # at the hand's height it may be in a finger
+        joint.qpos[2] = (
+            self.bodies[0].rest_height + _ABOVE
+        )  # at the hand's height it may be in a finger
         joint.qvel[:] = 0
 
     def _let_settle(self) -> None:

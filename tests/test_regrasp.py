@@ -22,9 +22,9 @@ def seen(joints: float, width: float) -> Observation:
 
 
 def test_it_goes_back_at_a_bounded_speed_and_gives_up_after_two_more_tries() -> None:
-    regrasp, first, way = Regrasp(HZ), seen(0.0, 0.04), np.ones((1, 8))
+    regrasp, first, way = Regrasp(HZ, TICKS), seen(0.0, 0.04), np.ones((1, 8))
     for miss in range(3):
-        said = [regrasp.next(seen(0.3, 0.001), first, True, 0.0, TICKS) for _ in range(3)]
+        said = [regrasp.next(seen(0.3, 0.001), first, True, 0.0) for _ in range(3)]
         assert said == ["act", "act", "back"], "a glance at shut fingers is not enough"
         assert bool(regrasp.given_up) == (miss == 2)
         way = regrasp.way_back(seen(0.3, 0.001), first, 16)
@@ -32,8 +32,8 @@ def test_it_goes_back_at_a_bounded_speed_and_gives_up_after_two_more_tries() -> 
             assert np.abs(way[:, :-1]).max() <= 0.6 / HZ + 1e-6
             assert way[:, -1].min() == np.float32(0.08)
             assert way[:, :-1].sum(0) == pytest.approx(-0.3, abs=1e-6)
-            assert regrasp.next(seen(0.1, 0.08), first, True, 0.08, TICKS) == "back"
-            assert regrasp.next(seen(0.01, 0.08), first, True, 0.08, TICKS) == "look again"
+            assert regrasp.next(seen(0.1, 0.08), first, True, 0.08) == "back"
+            assert regrasp.next(seen(0.01, 0.08), first, True, 0.08) == "look again"
     assert not way[:, :-1].any() and "3 of 3 tries" in regrasp.given_up
 
 
@@ -41,10 +41,10 @@ def test_it_goes_back_at_a_bounded_speed_and_gives_up_after_two_more_tries() -> 
 def test_an_object_is_lost_once_the_fingers_close_in_on_where_it_was_or_feel_it_no_more(
     in_by: float, feels: bool
 ) -> None:
-    regrasp, first = Regrasp(HZ), seen(0.0, 0.04)
+    regrasp, first = Regrasp(HZ, TICKS), seen(0.0, 0.04)
     for width in (0.08, 0.06, 0.03, 0.03, 0.03, 0.03, 0.03):
-        assert regrasp.next(seen(0.3, width), first, True, 0.0, TICKS) == "act"
-    said = regrasp.next(seen(0.3, 0.03 - in_by), first, feels, 0.0, TICKS)
+        assert regrasp.next(seen(0.3, width), first, True, 0.0) == "act"
+    said = regrasp.next(seen(0.3, 0.03 - in_by), first, feels, 0.0)
     assert said == ("act" if feels and in_by < 0.01 else "back")
 
 

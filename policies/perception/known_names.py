@@ -51,8 +51,7 @@ class KnownNames(nn.Module):
         found: list[tuple[Tensor, str]] = []
         for i in mark.argsort(descending=True).tolist():
             place = centres[cells[i]]
-            apart = all((place - other).norm() > _APART for other, _ in found)
-            if mark[i] > _SEEN and apart:
+            if mark[i] > _SEEN and all((place - other).norm() > _APART for other, _ in found):
                 found.append((place, NAMES[name[i]]))
         return list(dict.fromkeys(name for _, name in found))
 

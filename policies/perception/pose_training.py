@@ -178,19 +178,19 @@ def fit_trust(
     those without a sentence, `lack` of those with one; a bad one is off by 2 cm or 20 degrees. Only objects
     that a sentence identifies, or that stand alone, count. The estimator's known objects are fitted, too.
     """
-    sure, good, second, named, asked, keys = ([] for _ in range(6))
+    sure, good, second, named, found = ([] for _ in range(5))
     for rows, target, words in _targets(placements):
         start, sureness, others, *likeliest = _look(estimator, placements, rows, words)
         true = placements.start[rows, target]
         sure.append(sureness)
         second.append(others[:, 0])
         named.append(words.any(1))
-        asked.append(likeliest[0])
-        keys.append(likeliest[1])
+        found.append(likeliest)
         off = (start - true)[:, :2].norm(dim=1)
         good.append((off < _BAD[0]) & (_yaw_error(start, true) < _BAD[1]))
     shares, fine = torch.cat(sure), torch.cat(good)
-    others, said, objects = torch.cat(second), torch.cat(named), torch.cat(keys)
+    others, said = torch.cat(second), torch.cat(named)
+    asked, objects = (torch.cat(some) for some in zip(*found, strict=True))
     if not (fine & ~said).any():  # without good estimates, no threshold
         return estimator.config, {"good": 0.0, "bad": 0.0}
     least = shares[fine].quantile(_FALSE_REFUSALS / shares.shape[1], dim=0)
@@ -199,7 +199,7 @@ def fit_trust(
     config = replace(estimator.config, sure=(*least.tolist(),), second=most.item())
     if (fine & said).any():
         estimator.known.fit(objects[fine])
-        lack = estimator.lack(torch.cat(asked), objects)
+        lack = estimator.lack(asked, objects)
         config = replace(config, lack=lack[fine & said].quantile(1 - _FALSE_REFUSALS).item())
         refused |= (lack > config.lack) & said
     known = {"good": refused[fine].float().mean().item()}

@@ -307,8 +307,8 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
     @property
     def max_joint_step(self) -> Float[np.ndarray, " n"] | None:
         """Largest joint change (rad) that the safety layer lets through; None without one."""
-        clamped = self.config.as_deployed
-        return self.robot.policy.velocity / self.config.control_hz if clamped else None
+        config = self.config
+        return self.robot.policy.velocity / config.control_hz if config.as_deployed else None
 
     def calibrated_camera(self) -> CameraPlacement:
         """Return where the front camera is, base frame.
