@@ -109,15 +109,15 @@ class StateEstimator:
     @torch.inference_mode()
     def _begin(self, first: Mapping[str, np.ndarray]) -> None:
         """Begin an episode: estimate its poses, store its untouched gels."""
-        config, tcp = self.pose_estimator.config, torch.from_numpy(first[ft.TCP_POSE])[None]
+        network, tcp = self.pose_estimator, torch.from_numpy(first[ft.TCP_POSE])[None]
         self._check_hand(tcp)
         images = self._images(first)
         view = self._views.get(ft.FRONT)
         shift = torch.zeros(1, 3) if view is None else torch.from_numpy(view.shift[None]).float()
-        self._scene = self.pose_estimator.scene(images, tcp, shift)
-        look = self.pose_estimator.look(images, self._words, self._scene)
-        likeliest = self.pose_estimator.likeliest(images, self._words)
-        if self.target and self.pose_estimator.lack(*likeliest).item() > config.lack:
+        self._scene = network.scene(images, tcp, shift)
+        look = network.look(images, self._words, self._scene)
+        asked = network.likeliest(images, self._words) if self.target else None
+        if asked and network.lack(*asked).item() > network.config.lack:
             raise RefusedError(f"nothing here looks like '{self.target}': {self._seen(images)}")
         sureness = look.sureness[0].tolist()
         for (what, remedy), sure, least in zip(_ASKED.items(), sureness, self._least, strict=True):
@@ -125,7 +125,7 @@ class StateEstimator:
                 raise RefusedError(
                     f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): {remedy}"
                 )
-        if not self.target and look.second[0, 0] > config.second:
+        if not self.target and look.second[0, 0] > network.config.second:
             raise RefusedError(f"several objects may be what is meant: {self._seen(images)}")
         self._places = look.places
         self._start = self._latest = _unit_yaw(look.start[0].numpy())
