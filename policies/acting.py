@@ -1,7 +1,5 @@
 """Learned policy: `reset()` begins an episode, `act(observation)` returns a tick's action."""
 
-import math
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -98,7 +96,6 @@ class LearnedPolicy(Planner):
         self._check_delay(plan_ticks)
         self.observation_horizon = config.observation_horizon
         self.execution_horizon, self.control_hz = config.execution_horizon, config.control_hz
-        self._lasting = math.ceil(DONE_SECONDS * self.control_hz / self.execution_horizon)  # plans
         # the network's own observations, and those before them that the touch encoder looks back to
         self.history_ticks = config.observation_horizon + (touch.reach if touch else 0)
         self.reset()
@@ -121,10 +118,7 @@ class LearnedPolicy(Planner):
         self._first = first
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
         self._maps: tuple[Observation, Tensor] | None = None  # the latest embedded camera images
-        self._novel_plans = 0  # in a row
-        self._looks_done = deque[bool](
-            maxlen=self._lasting
-        )  # whether the latest plans found it done
+        self._novel_plans = self._done_plans = 0  # in a row
         self._key_pose = KeyPoseAverage(self.execution_horizon / self.control_hz)
         self._width: float | None = None  # of the gripper, where the next plan begins, m
 
@@ -164,12 +158,10 @@ class LearnedPolicy(Planner):
             self._refuse_novel(batch)
             plan = self._network.plan(batch, self._generator, self._width, self._key_pose)
             actions, done = plan.actions[0].numpy(), bool(plan.done[0])
-            self._looks_done.append(done)
-            needed = self._lasting
-            if self._network.end is not None and self._network.end.stands:
-                actions[:, :-1] *= not any(self._looks_done)
-                needed //= 2
-            self.done = sum(self._looks_done) >= needed
+            self._done_plans = self._done_plans + 1 if done else 0
+            if done and self._network.end is not None and self._network.end.stands:
+                actions[:, :-1] = 0.0
+            self.done = self._done_plans * self.execution_horizon >= DONE_SECONDS * self.control_hz
             # The last action of a plan comes a tick and `execution_horizon` ticks after its
             # observation. The whole motion is done where no age is known.
             reaction = (1 + self.execution_horizon) / self.control_hz

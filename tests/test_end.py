@@ -45,9 +45,8 @@ def test_a_policy_is_done_once_it_has_looked_so_for_a_while() -> None:
     assert not any(said(0.0, 20) + said(LIFTED, 12) + said(0.0, 6))  # 0.6 s are too short
     assert said(LIFTED, 24)[-4:] == [True] * 4
     moved = actor.act(dict(tick))[:7].any()
-    actor = LearnedPolicy(_fitted(LIFTED, goes_on=True)[0], None)  # which stands: half is enough
-    assert not any(said(LIFTED, 4) + said(0.0, 4)) and said(LIFTED, 4)[-1]
-    assert moved and not actor.act(dict(tick))[:7].any()
+    actor = LearnedPolicy(_fitted(LIFTED, goes_on=True)[0], None)
+    assert moved and said(LIFTED, 24)[-1] and not actor.act(dict(tick))[:7].any()
     actor.reset()
     assert not actor.done
 

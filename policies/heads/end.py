@@ -7,8 +7,7 @@ from torch import Tensor, nn
 from touchgoal.policies.heads.mlp import readout
 
 END_SECONDS = 0.5  # s at the end of a successful recording in which the task is done
-# s for which a policy must find it done, as an object that hovers over its place looks nearly so; one that
-# stands, for half of these: while it stands the force at the post fades, and it looks less so.
+# s for which a policy must find it done: an object that hovers over its place looks nearly so.
 DONE_SECONDS = 0.8
 _WIDTH = 64
 
