@@ -234,7 +234,7 @@ def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(benchmark, "KINDS", kinds)
     monkeypatch.setattr(benchmark, "TRUE_KINDS", kinds[:-1])
     sizes = "--episodes 1 --suboptimal 1 --successes 2 --training 4 --goals 1 --calibration 4"
-    words = f"reward-quality {sizes} --scenes fixed --every 4 --env.control-hz 5"
+    words = f"reward-quality {sizes} --scenes fixed --every 2 --env.control-hz 5"
     run_benchmark(*words.split(), "--env.camera-size", 64, 64, "--out", tmp_path)
     result = json.loads((tmp_path / "metrics.json").read_text())["scenes"]["fixed"]
     assert set(result["auc"]) == {*kinds, "mean of true kinds"}
