@@ -100,7 +100,7 @@ class PoseEstimatorConfig:
     # Most share of the first look at another place than the object's, without a sentence; training sets it.
     second: float = 1.0
     # Most by which a sentence may fit its object less than some known name does; training sets it.
-    lack: float = 1e3
+    misfit: float = 1e3
     front_camera: CameraPlacement = USUAL_CAMERA  # where it stood in training, up to its changes
 
 

@@ -135,11 +135,13 @@ class PoseEstimator(nn.Module):
         self, lit: Images, words: Float[Tensor, "b d"]
     ) -> tuple[Float[Tensor, "b c"], Float[Tensor, "b c"]]:
         """Return the first camera's query for the words, and the key of the cell that fits them best."""
-        asked, maps = self._finder.asks(words)[:, 0], self._maps(lit)
+        asked, maps = self._finder.queries_for(words)[:, 0], self._maps(lit)
         cells = torch.einsum("bc,bcp->bp", asked, maps).argmax(1)
         return asked, maps[torch.arange(len(maps)), :, cells]
 
-    def lack(self, asked: Float[Tensor, "b c"], keys: Float[Tensor, "b c"]) -> Float[Tensor, " b"]:
+    def misfit(
+        self, asked: Float[Tensor, "b c"], keys: Float[Tensor, "b c"]
+    ) -> Float[Tensor, " b"]:
         """Return by how much words fit what is `likeliest` less than its likeliest name does."""
         names = self.known.marks(self._names(), keys).amax(1)
         return names - self.known.marks(asked, keys).diagonal()
@@ -154,7 +156,7 @@ class PoseEstimator(nn.Module):
         return cast(_Finder, self.finders[0])
 
     def _names(self) -> Float[Tensor, "v c"]:
-        return self._finder.asks(embedded_names())[:, 0]
+        return self._finder.queries_for(embedded_names())[:, 0]
 
     def _maps(self, lit: Images) -> Float[Tensor, "b c cells"]:
         return self._finder.maps(lit[self.config.crops[0][0]]).flatten(2)
@@ -234,7 +236,7 @@ class _Finder(nn.Module):
     def forward(
         self, images: UInt8[Tensor, "b h w 3"], words: Float[Tensor, "b d"]
     ) -> Float[Tensor, "b 2 y x"]:
-        return torch.einsum("bqc,bcyx->bqyx", self.asks(words), self.maps(images))
+        return torch.einsum("bqc,bcyx->bqyx", self.queries_for(words), self.maps(images))
 
     def maps(self, images: UInt8[Tensor, "b h w 3"]) -> Float[Tensor, "b c y x"]:
         """Return the key of each cell."""
@@ -242,7 +244,7 @@ class _Finder(nn.Module):
         maps = self.patches(_pixels(images[:, top:bottom, left:right]))
         return self.keys(F.relu(self.surroundings(self.cells(F.relu(maps)))))
 
-    def asks(self, words: Float[Tensor, "b d"]) -> Float[Tensor, "b 2 c"]:
+    def queries_for(self, words: Float[Tensor, "b d"]) -> Float[Tensor, "b 2 c"]:
         """Return the queries of the object in words, and of the goal."""
         queries = self.queries.expand(len(words), -1, -1)
         return queries + torch.stack([self.words(words), torch.zeros_like(queries[:, 1])], 1)

@@ -172,10 +172,10 @@ def _add_pixel_noise(
 def fit_trust(
     estimator: PoseEstimator, placements: Placements
 ) -> tuple[PoseEstimatorConfig, dict[str, float]]:
-    """Return the config with `sure`, `second` and `lack`, and the shares of good and bad estimates refused.
+    """Return the config with `sure`, `second` and `misfit`, and the shares of good and bad estimates refused.
 
     Each number of `sure` refuses a quarter of the 2 % of good estimates that it may refuse, `second` 2 % of
-    those without a sentence, `lack` of those with one; a bad one is off by 2 cm or 20 degrees. Only objects
+    those without a sentence, `misfit` of those with one; a bad one is off by 2 cm or 20 degrees. Only objects
     that a sentence identifies, or that stand alone, count. The estimator's known objects are fitted, too.
     """
     sure, good, second, named, found = ([] for _ in range(5))
@@ -199,9 +199,9 @@ def fit_trust(
     config = replace(estimator.config, sure=(*least.tolist(),), second=most.item())
     if (fine & said).any():
         estimator.known.fit(objects[fine])
-        lack = estimator.lack(asked, objects)
-        config = replace(config, lack=lack[fine & said].quantile(1 - _FALSE_REFUSALS).item())
-        refused |= (lack > config.lack) & said
+        misfit = estimator.misfit(asked, objects)
+        config = replace(config, misfit=misfit[fine & said].quantile(1 - _FALSE_REFUSALS).item())
+        refused |= (misfit > config.misfit) & said
     known = {"good": refused[fine].float().mean().item()}
     known["bad"] = refused[~fine].sum().item() / max(int((~fine).sum()), 1)
     return config, known

@@ -117,7 +117,7 @@ class StateEstimator:
         self._scene = network.scene(images, tcp, shift)
         look = network.look(images, self._words, self._scene)
         asked = network.likeliest(images, self._words) if self.target else None
-        if asked and network.lack(*asked).item() > network.config.lack:
+        if asked and network.misfit(*asked).item() > network.config.misfit:
             raise RefusedError(f"nothing here looks like '{self.target}': {self._seen(images)}")
         sureness = look.sureness[0].tolist()
         for (what, remedy), sure, least in zip(_ASKED.items(), sureness, self._least, strict=True):
