@@ -91,7 +91,7 @@ def main(config: Config) -> None:
     kept = f"finished episodes are in {root}; the same command with --out {out} continues"
     try:
         with on_interruption(lambda: kept):
-            # in the maze success comes 3 cm before the post, where the end is felt and the expert is done
+            # the maze's success is 3 cm before its post; the expert leads the bead on and presses it there
             env = replace(config.env, ends_by_success=config.task != "bead-maze")
             metas = recording.collect(root, env, missing, config.ray or config.workers, roles, most)
     except recording.NoSuccessError as error:

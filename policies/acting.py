@@ -147,8 +147,8 @@ class LearnedPolicy(Planner):
         In an episode's first call the oldest observation is the untouched first one.
         """
         self.embed(history)
-        seen = self._learned_estimator
-        if seen and (other := self._second_try(history[-1], seen.touches)) is not None:
+        estimator = self._learned_estimator
+        if estimator and (other := self._second_try(history[-1], estimator.touches)) is not None:
             return other
         with one_thread():
             _, touch, state = zip(*self._embedded, strict=True)
@@ -176,7 +176,7 @@ class LearnedPolicy(Planner):
     def _second_try(
         self, observation: Observation, touches: bool
     ) -> Float32[np.ndarray, "h 8"] | None:
-        """Return the way back after the hand has closed on nothing or lost it; None: the policy acts."""
+        """Return the way back after the hand closed on nothing, or lost its object; None: the policy acts."""
         first, ticks = self._first, self.config.prediction_horizon
         what = self._regrasp.next(observation, first, touches, self._width)
         if what == "look again":

@@ -34,7 +34,7 @@ class Regrasp:
     def next(
         self, observation: Observation, first: Observation, touches: bool, wanted: float | None
     ) -> Literal["act", "back", "look again"]:
-        """Return what the next plan is for; `wanted` (m) is the hand's width by the last one."""
+        """Return what the next plan is for, if a fingertip touches or not, at the width last wanted (m)."""
         if self.given_up:
             return "back"
         joints, width = observation[ft.STATE][:N_JOINTS], observation[ft.STATE][-1]
@@ -67,7 +67,7 @@ class Regrasp:
 
     def give_up(self, why: str) -> None:
         """End the tries."""
-        self.given_up = f"the hand closed on nothing ({self._misses} of {1 + _TRIES} tries): {why}"
+        self.given_up = f"the hand holds nothing ({self._misses} of {1 + _TRIES} tries): {why}"
 
     def way_back(
         self, observation: Observation, first: Observation, ticks: int

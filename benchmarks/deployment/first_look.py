@@ -194,11 +194,9 @@ def _look(config: Config, name: str) -> list[tuple[float, float] | None]:
         image = first[ft.FRONT]
         first = {**first, ft.FRONT: image if change.image is None else change.image(image)}
         first |= dict.fromkeys(ft.TACTILE, np.zeros((8, 8, 3), np.uint8))
-        there = [body.kind.name for body in env.bodies]
-        absent = next(
-            n for n in NAMES[seed % len(NAMES) :] + NAMES if n.replace(" ", "_") not in there
-        )
-        target = change.target.format(object=there[0].replace("_", " "), absent=absent)
+        there = [body.kind.name.replace("_", " ") for body in env.bodies]
+        absent = next(n for n in NAMES[seed % len(NAMES) :] + NAMES if n not in there)
+        target = change.target.format(object=there[0], absent=absent)
         estimator = StateEstimator(network, target, env.calibrated_camera())
         try:
             with one_thread():

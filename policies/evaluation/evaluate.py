@@ -24,7 +24,7 @@ from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tasks import make_env
 
 REFUSED = "refused"  # failure of an episode in which the policy would not act
-GAVE_UP = "gave up"  # of one in which it closed on nothing again and again
+GAVE_UP = "gave up"  # of one in which it held nothing again and again
 FALSELY_DONE = "falsely done"  # of one that it ended as done
 _TOLERANCE = 1e-3  # rad or m by which an action may exceed a limit before it counts as clamped
 _LIGHT_TICKS = 10  # from one look at the fingertips' light to the next

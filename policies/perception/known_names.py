@@ -17,7 +17,7 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE
 NAMES = tuple(name.replace("_", " ") for name in CATALOGUE)
 _KEPT, _BEST = 512, 0.99  # objects, and the quantile of their scores that is marked 1
 _SEEN = 0.6  # least mark of a name that counts as seen
-_APART = 24.0  # px between two objects that are told apart
+_APART = 24.0  # px; what is nearer to each other is one object
 
 
 class KnownNames(nn.Module):

@@ -143,8 +143,8 @@ class PoseEstimator(nn.Module):
         self, asked: Float[Tensor, "b c"], keys: Float[Tensor, "b c"]
     ) -> Float[Tensor, " b"]:
         """Return by how much words fit what is `likeliest` less than its likeliest name does."""
-        names = self.known.marks(self._names(), keys).amax(1)
-        return names - self.known.marks(asked, keys).diagonal()
+        best = self.known.marks(self._names(), keys).amax(1)
+        return best - self.known.marks(asked, keys).diagonal()
 
     def seen(self, lit: Images) -> list[str]:
         """Return names of the objects in the first of some evenly lit images, the surest first."""

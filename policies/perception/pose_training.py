@@ -200,8 +200,8 @@ def fit_trust(
     if (fine & said).any():
         estimator.known.fit(objects[fine])
         misfit = estimator.misfit(asked, objects)
-        config = replace(config, misfit=misfit[fine & said].quantile(1 - _FALSE_REFUSALS).item())
-        refused |= (misfit > config.misfit) & said
+        limit = misfit[fine & said].quantile(1 - _FALSE_REFUSALS).item()
+        config, refused = replace(config, misfit=limit), refused | ((misfit > limit) & said)
     known = {"good": refused[fine].float().mean().item()}
     known["bad"] = refused[~fine].sum().item() / max(int((~fine).sum()), 1)
     return config, known

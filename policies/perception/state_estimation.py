@@ -116,9 +116,9 @@ class StateEstimator:
         shift = torch.zeros(1, 3) if view is None else torch.from_numpy(view.shift[None]).float()
         self._scene = network.scene(images, tcp, shift)
         look = network.look(images, self._words, self._scene)
-        asked = network.likeliest(images, self._words) if self.target else None
-        if asked and network.misfit(*asked).item() > network.config.misfit:
-            raise RefusedError(f"nothing here looks like '{self.target}': {self._seen(images)}")
+        if self.target and (limit := network.config.misfit) is not None:
+            if network.misfit(*network.likeliest(images, self._words)).item() > limit:
+                raise RefusedError(f"nothing here looks like '{self.target}': {self._seen(images)}")
         sureness = look.sureness[0].tolist()
         for (what, remedy), sure, least in zip(_ASKED.items(), sureness, self._least, strict=True):
             if sure < least:
