@@ -47,9 +47,10 @@ def test_delays_that_would_do_nothing_are_refused() -> None:
 
 @pytest.mark.parametrize("option", ["state_delay", "image_delay"])
 def test_what_is_seen_is_as_old_as_it_says(option: str) -> None:
-    config = replace(BLIND, cameras=("front",), camera_size=(32, 32))
-    here = roll(moving(), config, between={})
-    late = roll(moving(), config, between={option: (0.1, 0.1)})
+    """And remains so while the arm rests after the end."""
+    config = replace(BLIND, cameras=("front",), camera_size=(32, 32), max_seconds=0.2)
+    here = roll(moving(24), config, between={})
+    late = roll(moving(24), config, between={option: (0.1, 0.1)})
     for key in (ft.STATE, ft.TCP_POSE, ft.WRENCH, ft.FRONT):
         images = key == ft.FRONT
         ticks = 2 if images == (option == "image_delay") else 0
@@ -57,7 +58,7 @@ def test_what_is_seen_is_as_old_as_it_says(option: str) -> None:
         assert np.array_equal(then[ticks:], now[: len(now) - ticks]), key
         assert np.array_equal(then[:ticks], now[:1].repeat(ticks, 0)), key
     assert not column(here, ft.AGE).any()
-    np.testing.assert_allclose(column(late, ft.AGE)[:, 0], np.arange(9).clip(0, 2) / 20, atol=1e-6)
+    np.testing.assert_allclose(column(late, ft.AGE)[:, 0], np.arange(25).clip(0, 2) / 20, atol=1e-6)
 
 
 def test_a_command_arrives_so_late() -> None:
