@@ -13,6 +13,7 @@ _BRIGHT = 245.0  # counts: mean above which the picture is overexposed
 # Counts: mean second difference along the rows of the middle cell; noise of 1 count makes 2. Real
 # Minis, DIGITs and Wedges reach 1 to 4.3, simulated ones 2 to 5.
 _NOISY = 12.0
+_SECOND_DIFFERENCE = np.array([[1.0, -2.0, 1.0]], np.float32)
 _CELL = 8  # px
 _CONFIRMING = 3  # new frames in a row; a driver may pass on a single bad one
 _STILL = 6  # new frames in a row without a change, 0.3 s of a control loop
@@ -22,7 +23,7 @@ class FingertipHealth:
     """Health of one fingertip, followed frame by frame."""
 
     def __init__(self, sensor: SensorModel) -> None:
-        self._sensor, self._parts = sensor, FrozenParts()
+        self._usual, self._parts = usual_light(sensor), FrozenParts()
         self._frames = self._bad = 0
 
     @property
@@ -35,15 +36,23 @@ class FingertipHealth:
         self._frames += 1
         if self._frames - self._parts.update(frame, self._frames) >= _STILL:
             return "its image or a part of it stands still: check its cable and driver"
-        wrong = image_fault(frame, self._sensor)
+        wrong = image_fault(frame, self._usual)
         self._bad = self._bad + 1 if wrong else 0
         return wrong if self._bad >= _CONFIRMING else ""
 
 
-def image_fault(frame: Image, sensor: SensorModel) -> str:
-    """Return what is wrong with one RGB image of a fingertip, touched or not; "" if nothing."""
-    light = float(frame.mean())
-    if light < _DARK * float(load(sensor.sensor_file).background.mean()):
+def usual_light(sensor: SensorModel) -> float:
+    """Return the mean of a sensor's untouched image, counts."""
+    return float(load(sensor.sensor_file).background.mean())
+
+
+def image_fault(frame: Image, usual: float) -> str:
+    """Return what is wrong with one RGB image of a fingertip, touched or not; "" if nothing.
+
+    `usual` is the sensor's `usual_light`.
+    """
+    light = float(np.mean(cv2.mean(frame)[:3]))
+    if light < _DARK * usual:
         return "its image is black: check its light and cable"
     if light > _BRIGHT:
         return "its image is overexposed: check its exposure"
@@ -54,7 +63,7 @@ def image_fault(frame: Image, sensor: SensorModel) -> str:
 
 def _noise(frame: Image) -> float:
     """Return the mean second difference of the middle cell (counts): dots and edges are few."""
-    x = frame.astype(np.int16)
-    rough = np.abs(x[:, 2:] - 2 * x[:, 1:-1] + x[:, :-2]).mean(2, dtype=np.float32)
+    rough = np.abs(cv2.filter2D(frame, cv2.CV_16S, _SECOND_DIFFERENCE)[:, 1:-1])
     size = max(rough.shape[1] // _CELL, 1), max(rough.shape[0] // _CELL, 1)
-    return float(np.median(cv2.resize(rough, size, interpolation=cv2.INTER_AREA)))
+    cells = cv2.resize(rough.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return float(np.median(cells.mean(2)))

@@ -98,14 +98,14 @@ def find_seam(image: Image, before: Image | None = None) -> str:
     A pressed edge steps as sharply, but hardly changes what lies beyond it: with the whole image
     `before` it, a step counts only where a side of it has changed altogether.
     """
-    for axis, name in enumerate(("row", "column")):
-        lines = np.swapaxes(image, 0, axis)
-        count = lines.shape[0]
-        margin = count // _EDGE
-        if margin < 3:  # too small to check
-            return ""
-        size = (_SEAM_PARTS, count)
-        light = cv2.resize(lines.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    height, width, _ = image.shape
+    if min(height, width) < 3 * _EDGE:  # too small to check
+        return ""
+    exact = image.astype(np.float32)
+    sizes = {"row": (_SEAM_PARTS, height), "column": (width, _SEAM_PARTS)}
+    for axis, (name, size) in enumerate(sizes.items()):
+        lines, margin = np.swapaxes(image, 0, axis), image.shape[axis] // _EDGE
+        light = np.swapaxes(cv2.resize(exact, size, interpolation=cv2.INTER_AREA), 0, axis)
         step = np.diff(light, axis=0)
         jump = np.abs(step[1:-1] - (step[:-2] + step[2:]) / 2).sum(2)
         usual = np.median(jump, 1)[margin:-margin]
