@@ -21,6 +21,7 @@ WORKSPACE = ((0.40, 0.60), (-0.20, 0.20))  # m, where objects start and goals li
 _GONE, _ABOVE = (0.5, 0.9), 2e-3  # m: a place beside the table; over the table, to fall from
 _LIFTED = 0.03  # m above rest that counts as picked up
 _MOST_MISSES = 200  # draws too near to another place, after which all places are drawn again
+_SIDES = 8  # to which an object is moved, at most, until it is not in the hand
 _APART = 0.12  # m at least between objects, and between start and goal
 
 
@@ -143,11 +144,21 @@ class PickPlace(FrankaTactileEnv):
     def begin_tick(self) -> None:
         """Move the object a second after the start, if `nudge` asks for it."""
         if self.config.nudge and self._ticks == self.config.control_hz:
-            angle = self.np_random.uniform(-np.pi, np.pi)
-            away = self.config.nudge * np.array([np.cos(angle), np.sin(angle)])
-            self.data.joint("object").qpos[:2] += away
+            self._nudge()
         if self.config.interference and not self._interfered:
             self._interfere(self.config.interference == "taken")
+
+    def _nudge(self) -> None:
+        """Move the object to any side, but not into the hand; it stays if the hand is all around."""
+        pose = self.data.joint("object").qpos
+        before = pose[:2].copy()
+        for _ in range(_SIDES):
+            angle = self.np_random.uniform(-np.pi, np.pi)
+            pose[:2] = before + self.config.nudge * np.array([np.cos(angle), np.sin(angle)])
+            self.update_contacts()
+            if not self.external_wrench().any():
+                return
+        pose[:2] = before
 
     def _interfere(self, taken: bool) -> None:
         """Take the object away, or knock it out of the hand onto the table, once the time has come."""

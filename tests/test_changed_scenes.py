@@ -64,6 +64,14 @@ def test_objects_grow_lose_friction_and_are_moved_after_a_second() -> None:
         changed.step(stay)
     moves = np.linalg.norm(np.diff(places, axis=0), axis=1)
     assert moves[:-1].max() < 2e-4 and moves[-1] == pytest.approx(0.02, abs=2e-3)
+    for seed in range(6):  # the hand is around it: two of its sides are fingers
+        changed.reset(seed=seed, options={"object": "soda_can"})
+        pose, changed._ticks = changed.data.joint("object").qpos, changed.config.control_hz
+        pose[:3] = between = changed.data.site("tcp").xpos.copy()
+        changed.begin_tick()
+        changed.update_contacts()
+        assert not changed.external_wrench().any()
+        assert np.linalg.norm(pose[:2] - between[:2]) == pytest.approx(0.02)
 
 
 def test_a_kept_opengl_context_draws_what_a_new_one_draws() -> None:
