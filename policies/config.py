@@ -97,8 +97,6 @@ class PoseEstimatorConfig:
     # Least share of the first look near the object and near the goal, least length of the vector of the
     # yaw, and least probability of an unmirrored image, in which the estimate is trusted; training sets them.
     sure: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    # Most share of the first look at another place than the object's, without a sentence; training sets it.
-    second: float = 1.0
     # Most by which a sentence may fit its object less than some known name does; None until training sets it.
     misfit: float | None = None
     front_camera: CameraPlacement = USUAL_CAMERA  # where it stood in training, up to its changes

@@ -97,7 +97,7 @@ def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.Mo
     def look(*_: object) -> Look:
         start = torch.tensor([[now["x"], 0, 0, 1, 0, 0.3, 0.3]])
         sure, one = torch.full((1, 2), now["sure"]), torch.ones(1)
-        return Look(start, sure, one, one, {}, torch.zeros(1, 2))
+        return Look(start, sure, one, one, {})
 
     monkeypatch.setattr(PoseEstimator, "look", look)
     gel = np.full((120, 160, 3), 90, np.uint8)

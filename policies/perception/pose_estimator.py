@@ -25,7 +25,6 @@ _TCP = ft.FEATURES[ft.TCP_POSE].shape[0]
 _PATCH = 4  # px between two cells of a crop
 _CELL = 8  # px between two cells of a finder's map
 _PEAK = 1.5  # cells around a map's maximum over which the place is averaged
-_APART = 3.0  # cells between a place and the next one
 _NEAR, _LEAST_GAIN = 40.0, -1.5  # px; a clearly better place far away still wins
 # Centre of the first cell, px: that of the 8 pixels of its patch, which begin at -2.
 _FIRST = 1.5
@@ -47,8 +46,6 @@ class Look:
     turned: Float[Tensor, " b"]
     unmirrored: Float[Tensor, " b"]  # probability that left is left in the image
     places: Places
-    # share of the scores near the likeliest other place of the object, and of the goal
-    second: Float[Tensor, "b 2"]
 
     @property
     def sureness(self) -> Float[Tensor, "b 4"]:
@@ -125,11 +122,11 @@ class PoseEstimator(nn.Module):
             crops = self.config.crops
             scores = {key: scores[key] + _nearness(before[key], box) for key, box in crops}
         found = {key: _find(scores[key], box) for key, box in self.config.crops}
-        places = {key: place for key, (place, _, _) in found.items()}
+        places = {key: place for key, (place, _) in found.items()}
         start = self.start_normalizer.inverse(self.scaled(lit, scene, places))
-        surest, second = (torch.stack([f[i] for f in found.values()]).amax(0) for i in (1, 2))
+        surest = torch.stack([share for _, share in found.values()]).amax(0)
         turned, unmirrored = start[:, 3:5].norm(dim=1), self.unmirrored(scene)[:, 0].sigmoid()
-        return Look(start, surest, turned, unmirrored, places, second)
+        return Look(start, surest, turned, unmirrored, places)
 
     def likeliest(
         self, lit: Images, words: Float[Tensor, "b d"]
@@ -265,27 +262,14 @@ def _nearness(places: Float[Tensor, "b 2 2"], box: Box) -> Float[Tensor, "b 2 y 
 
 def _find(
     scores: Float[Tensor, "b 2 y x"], box: Box
-) -> tuple[Float[Tensor, "b 2 2"], Float[Tensor, "b 2"], Float[Tensor, "b 2"]]:
-    """Return the places (px) around the highest scores, their share, and that of the next place.
-
-    The next place is that of the highest score apart from there.
-    """
+) -> tuple[Float[Tensor, "b 2 2"], Float[Tensor, "b 2"]]:
+    """Return the places (px) around the highest scores, and their share."""
     centres = _centres(box).to(scores).flatten(0, 1)
     scores = scores.flatten(2)
     share = scores.softmax(2)
-    far = _distances(share, centres)
-    near = far <= _PEAK * _CELL
+    near = (centres[share.argmax(2)][:, :, None] - centres).norm(dim=-1) <= _PEAK * _CELL
     place = scores.masked_fill(~near, -torch.inf).softmax(2) @ centres
-    others = share.masked_fill(far <= _APART * _CELL, 0)
-    second = others.masked_fill(_distances(others, centres) > _PEAK * _CELL, 0).sum(2)
-    return place, share.masked_fill(~near, 0).sum(2), second
-
-
-def _distances(
-    share: Float[Tensor, "b 2 cells"], centres: Float[Tensor, "cells 2"]
-) -> Float[Tensor, "b 2 cells"]:
-    """Return the distance of each cell from the one with the highest share, px."""
-    return (centres[share.argmax(2)][:, :, None] - centres).norm(dim=-1)
+    return place, share.masked_fill(~near, 0).sum(2)
 
 
 class _SpatialSoftmax(nn.Module):

@@ -172,31 +172,28 @@ def _add_pixel_noise(
 def fit_trust(
     estimator: PoseEstimator, placements: Placements
 ) -> tuple[PoseEstimatorConfig, dict[str, float]]:
-    """Return the config with `sure`, `second` and `misfit`, and the shares of good and bad estimates refused.
+    """Return the config with `sure` and `misfit`, and the shares of good and bad estimates refused.
 
-    Each number of `sure` refuses a quarter of the 2 % of good estimates that it may refuse, `second` 2 % of
-    those without a sentence, `misfit` of those with one; a bad one is off by 2 cm or 20 degrees. Only objects
-    that a sentence identifies, or that stand alone, count. The estimator's known objects are fitted, too.
+    Each number of `sure` refuses a quarter of the 2 % of good estimates that it may refuse, `misfit` 2 % of
+    those with a sentence; a bad one is off by 2 cm or 20 degrees. Only objects that a sentence identifies, or
+    that stand alone, count. The estimator's known objects are fitted, too.
     """
-    sure, good, second, named, found = ([] for _ in range(5))
+    sure, good, named, found = ([] for _ in range(4))
     for rows, target, words in _targets(placements):
-        start, sureness, others, *likeliest = _look(estimator, placements, rows, words)
+        start, sureness, *likeliest = _look(estimator, placements, rows, words)
         true = placements.start[rows, target]
         sure.append(sureness)
-        second.append(others[:, 0])
         named.append(words.any(1))
         found.append(likeliest)
         off = (start - true)[:, :2].norm(dim=1)
         good.append((off < _BAD[0]) & (_yaw_error(start, true) < _BAD[1]))
-    shares, fine = torch.cat(sure), torch.cat(good)
-    others, said = torch.cat(second), torch.cat(named)
+    shares, fine, said = (torch.cat(some) for some in (sure, good, named))
     asked, objects = (torch.cat(some) for some in zip(*found, strict=True))
-    if not (fine & ~said).any():  # without good estimates, no threshold
+    if not fine.any():  # no threshold
         return estimator.config, {"good": 0.0, "bad": 0.0}
     least = shares[fine].quantile(_FALSE_REFUSALS / shares.shape[1], dim=0)
-    most = others[fine & ~said].quantile(1 - _FALSE_REFUSALS)
-    refused = (shares < least).any(1) | ((others > most) & ~said)
-    config = replace(estimator.config, sure=(*least.tolist(),), second=most.item())
+    refused = (shares < least).any(1)
+    config = replace(estimator.config, sure=(*least.tolist(),))
     if (fine & said).any():
         estimator.known.fit(objects[fine])
         misfit = estimator.misfit(asked, objects)
@@ -263,13 +260,13 @@ def _look(
     rows: Int64[Tensor, " n"],
     words: Float[Tensor, "n d"],
 ) -> tuple[Float[Tensor, "n _"], ...]:
-    """Return start, sureness and second places of each `Look`, and what is `likeliest`."""
+    """Return start and sureness of each `Look`, and what is `likeliest`."""
     looks = []
     for some, chosen in zip(rows.split(_BATCH), words.split(_BATCH), strict=True):
         lit = evenly_lit({key: images[some] for key, images in placements.images.items()})
         scene = estimator.scene(lit, placements.tcp[some], placements.shift[some])
         look, likeliest = estimator.look(lit, chosen, scene), estimator.likeliest(lit, chosen)
-        looks.append((look.start, look.sureness, look.second, *likeliest))
+        looks.append((look.start, look.sureness, *likeliest))
     return tuple(torch.cat(parts) for parts in zip(*looks, strict=True))
 
 

@@ -116,7 +116,8 @@ class StateEstimator:
         shift = torch.zeros(1, 3) if view is None else torch.from_numpy(view.shift[None]).float()
         self._scene = network.scene(images, tcp, shift)
         look = network.look(images, self._words, self._scene)
-        if self.target and (limit := network.config.misfit) is not None:
+        limit = network.config.misfit  # None: it knows no names
+        if self.target and limit is not None:
             if network.misfit(*network.likeliest(images, self._words)).item() > limit:
                 raise RefusedError(f"nothing here looks like '{self.target}': {self._seen(images)}")
         sureness = look.sureness[0].tolist()
@@ -125,7 +126,7 @@ class StateEstimator:
                 raise RefusedError(
                     f"the camera does not show well {what} ({sure:.2f} sure, {least:.2f} needed): {remedy}"
                 )
-        if not self.target and look.second[0, 0] > network.config.second:
+        if not self.target and limit is not None and len(network.seen(images)) > 1:
             raise RefusedError(f"several objects may be what is meant: {self._seen(images)}")
         self._places = look.places
         self._start = self._latest = _unit_yaw(look.start[0].numpy())
