@@ -10,7 +10,8 @@ from jaxtyping import Float, Float16
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
-from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
+from touchgoal.encoders.compiled_network import CompiledNetwork
+from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_pixels
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.perception.pose_estimator import keypoints
@@ -18,7 +19,7 @@ from touchgoal.runtime.errors import UserError
 
 MAP_CHANNELS = 40  # of `EfficientNetLite0.fine_map`
 _SHARPNESS = 10.0  # of the softmax; all keypoints begin in the middle and soon leave it
-_BATCH = 4  # images; the activations of more leave the cache
+_BATCH = 32  # images
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class ImageEmbedder:
 
     def __init__(self, config: ImageInputConfig) -> None:
         """Get ready; UserError if the image tower's wheel is missing."""
-        self.config, self._network = config, _network()
+        self.config = config
         cameras = "-".join(key.removeprefix(ft.IMAGE_PREFIX) for key in config.cameras)
         self.name = f"efficientnet-lite0-stride8/{cameras}"
         blank = np.zeros((1, *config.size, 3), np.uint8)
@@ -68,17 +69,24 @@ class ImageEmbedder:
                 f"camera images are {given}, the policy reads {wanted}: make the environment with "
                 "load_policy(...).env_config(), or set camera_size"
             )
-        with torch.no_grad():
-            batches = [
-                self._network.fine_map(imagenet_pixels(images[i : i + _BATCH])).half().numpy()
-                for i in range(0, len(images), _BATCH)
-            ]
-        return np.concatenate(batches)
+        batches = [images[i : i + _BATCH] for i in range(0, len(images), _BATCH)]
+        return np.concatenate([_network()(imagenet_pixels(b))[0].half().numpy() for b in batches])
+
+
+class _FineMap(nn.Module):
+    """The image tower up to stride 8."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tower = load_efficientnet_lite0().requires_grad_(False)
+
+    def forward(self, x: Float[Tensor, "n 3 h w"]) -> tuple[Float[Tensor, "n c y x"]]:
+        return (self.tower.fine_map(x),)
 
 
 @cache
-def _network() -> EfficientNetLite0:
-    return load_efficientnet_lite0().requires_grad_(False)
+def _network() -> CompiledNetwork:
+    return CompiledNetwork(_FineMap().eval())
 
 
 class ImageReadout(nn.Module):
