@@ -164,6 +164,24 @@ def test_of_two_objects_that_fit_equally_the_one_before_is_kept() -> None:
         torch.testing.assert_close(found, before[ft.FRONT], atol=0.1, rtol=0)
 
 
+def test_a_box_that_looks_turned_in_two_ways_is_turned_as_the_surest_crop_says() -> None:
+    sight, lit = PoseEstimator(SMALL).eval(), {ft.FRONT: torch.zeros(1, 32, 32, 3).byte()}
+
+    def scaled(_: object, scene: torch.Tensor, places: dict[str, torch.Tensor]) -> torch.Tensor:
+        start = torch.ones(len(scene), 7)  # in both ways, but for one crop
+        start[:, 3:5] = torch.tensor([0.0, 0.1])
+        start[places[ft.FRONT][:, 0].eq(torch.tensor([10.0, 13.0])).all(1), 4] = -0.9
+        return start
+
+    sight.scaled = scaled  # type: ignore[method-assign]
+    start, one = torch.tensor([[0.5, 0.1, 0.02, 0.1, 0.0, 0.4, 0.2]]), torch.ones(1)
+    look = Look(start, torch.ones(1, 2), start[:, 3], one, {ft.FRONT: torch.full((1, 2, 2), 16.0)})
+    found = sight.turned_surely(lit, torch.zeros(1, 4), look)
+    assert found.turned.item() == pytest.approx(0.9)
+    yaw = torch.tensor([[0.0, -0.9]])
+    torch.testing.assert_close(found.start, torch.cat([start[:, :3], yaw, start[:, 5:]], 1))
+
+
 def test_a_sentence_fits_its_object_alone() -> None:
     rng = np.random.default_rng(0)
     looks = [

@@ -5,6 +5,7 @@ resolution, gives their poses. Keypoints of the whole image give the camera's po
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import cast
 
 import torch
@@ -24,6 +25,7 @@ _PARTS = (5, 2)  # numbers of `features.TRUTH_START` on the object and on the go
 _TCP = ft.FEATURES[ft.TCP_POSE].shape[0]
 _PATCH = 4  # px between two cells of a crop
 _CELL = 8  # px between two cells of a finder's map
+_MOVES = (-6.0, -3.0, 0.0, 3.0, 6.0)  # px
 _PEAK = 1.5  # cells around a map's maximum over which the place is averaged
 _NEAR, _LEAST_GAIN = 40.0, -1.5  # px; a clearly better place far away still wins
 # Centre of the first cell, px: that of the 8 pixels of its patch, which begin at -2.
@@ -127,6 +129,21 @@ class PoseEstimator(nn.Module):
         surest = torch.stack([share for _, share in found.values()]).amax(0)
         turned, unmirrored = start[:, 3:5].norm(dim=1), self.unmirrored(scene)[:, 0].sigmoid()
         return Look(start, surest, turned, unmirrored, places)
+
+    def turned_surely(self, lit: Images, scene: Float[Tensor, "1 s"], look: Look) -> Look:
+        """Return a look with the surest yaw of crops around places moved by some px.
+
+        A box that is nearly square looks turned in two ways, between which one crop may not choose: it can be
+        grasped in both.
+        """
+        moves = torch.tensor(list(product(_MOVES, _MOVES)), dtype=torch.float)
+        places = {key: place + moves[:, None] for key, place in look.places.items()}
+        images = {key: some.expand(len(moves), -1, -1, -1) for key, some in lit.items()}
+        scaled = self.scaled(images, scene.expand(len(moves), -1), places)
+        yaws = self.start_normalizer.inverse(scaled)[:, 3:5]
+        turned, start = yaws.norm(dim=1), look.start.clone()
+        start[:, 3:5] = yaws[turned.argmax()]
+        return replace(look, start=start, turned=turned.max()[None])
 
     def likeliest(
         self, lit: Images, words: Float[Tensor, "b d"]

@@ -120,6 +120,8 @@ class StateEstimator:
         if self.target and limit is not None:
             if network.misfit(*network.likeliest(images, self._words)).item() > limit:
                 raise RefusedError(f"nothing here looks like '{self.target}': {self._seen(images)}")
+        if look.turned.item() < self._least[2]:
+            look = network.turned_surely(images, self._scene, look)
         sureness = look.sureness[0].tolist()
         for (what, remedy), sure, least in zip(_ASKED.items(), sureness, self._least, strict=True):
             if sure < least:
