@@ -89,10 +89,13 @@ def test_a_hand_that_starts_elsewhere_than_in_training_is_refused() -> None:
             StateEstimator(network, "the red one")._begin(tick)
 
 
-def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two looks must agree; a look that is not sure counts for nothing, a first one ends it."""
-    estimator = StateEstimator(PoseEstimator(replace(SMALL, sure=(0.3, 0.3, 0.5, 0.5))).eval())
-    now = {"x": 0.0, "sure": 1.0}
+GEL = np.full((120, 160, 3), 90, np.uint8)
+FIRST = dict.fromkeys(ft.TACTILE, GEL) | {ft.FRONT: np.zeros((32, 32, 3), np.uint8)}
+TOUCH = dict.fromkeys(ft.TACTILE, cv2.circle(GEL.copy(), (80, 60), 20, (190, 20, 140), -1))
+
+
+def sees(now: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> StateEstimator:
+    """Return an estimator that sees the object at `x`, as `sure` as that."""
 
     def look(*_: object) -> Look:
         start = torch.tensor([[now["x"], 0, 0, 1, 0, 0.3, 0.3]])
@@ -100,12 +103,15 @@ def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.Mo
         return Look(start, sure, one, one, {})
 
     monkeypatch.setattr(PoseEstimator, "look", look)
-    gel = np.full((120, 160, 3), 90, np.uint8)
-    first = dict.fromkeys(ft.TACTILE, gel) | {ft.TCP_POSE: np.full(7, 0.3, np.float32)}
-    first[ft.FRONT] = np.zeros((32, 32, 3), np.uint8)
-    touch = dict.fromkeys(ft.TACTILE, cv2.circle(gel.copy(), (80, 60), 20, (190, 20, 140), -1))
+    return StateEstimator(PoseEstimator(replace(SMALL, sure=(0.3, 0.3, 0.5, 0.5))).eval())
+
+
+def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two looks must agree; a look that is not sure counts for nothing, a first one ends it."""
+    now = {"x": 0.0, "sure": 1.0}
+    estimator, first = sees(now, monkeypatch), FIRST | {ft.TCP_POSE: np.full(7, 0.3, np.float32)}
     seen = []
-    steps = ((0.0, 1.0, {}), (0.5, 0.1, {}), *[(0.5, 1.0, {})] * 2, *[(0.9, 1.0, touch)] * 2)
+    steps = ((0.0, 1.0, {}), (0.5, 0.1, {}), *[(0.5, 1.0, {})] * 2, *[(0.9, 1.0, TOUCH)] * 2)
     for now["x"], now["sure"], more in steps:
         tick = {**first, **more} if seen else first
         seen.append(estimator.estimate(tick, first)[ft.TRUTH_START][0])
@@ -113,6 +119,16 @@ def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.Mo
     now["sure"] = 0.2
     with pytest.raises(RefusedError, match="where the object is .0.20 sure, 0.30 needed"):
         estimator.estimate(dict(first), dict(first))
+
+
+def test_a_hand_that_hides_the_object_misleads_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, seen = {"x": 0.0, "sure": 1.0}, []
+    estimator, first = sees(now, monkeypatch), {}
+    for now["x"], height in [(0.0, 0.3), *[(0.02, 0.07), (0.02, 0.07), (0.0, 0.2), (0.0, 0.2)] * 2]:
+        tick = FIRST | {ft.TCP_POSE: np.array([0, 0, height, 0, 1, 0, 0], np.float32)}
+        first = first or tick
+        seen.append(estimator.estimate(tick, first)[ft.TRUTH_START][0])
+    assert seen == pytest.approx([0, 0, 0.02, 0.02, 0, 0, 0, 0, 0])
 
 
 def test_a_hand_tilted_by_a_thousandth_changes_no_estimate() -> None:

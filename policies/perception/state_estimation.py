@@ -46,8 +46,9 @@ _ASKED = {  # and what to do
     "which side is left": "it may be mirrored: let the camera send images as they are",
 }
 # m. The object has moved if two later estimates agree within the first distance and lie the second
-# one away from the known place. A hand nearer than the third distance hides too much.
-_AGREE, _MOVED, _NEAREST = 0.006, 0.014, 0.04
+# one away from the known place. A hand nearer than the third distance hides too much. Once the object
+# seems back within the fourth distance of where it was, estimates from nearer than the fifth count no more.
+_AGREE, _MOVED, _NEAREST, _BACK, _HIDES = 0.006, 0.014, 0.04, 0.008, 0.08
 ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 
 
@@ -85,7 +86,8 @@ class StateEstimator:
         self._scene, self._places = torch.empty(1, 0), Places()
         self._start = self._latest = np.empty(0, np.float32)
         self._contact: dict[str, ContactDetector] = {}
-        self.touches = self._touched = False
+        self.touches = self._touched = self._misled = False
+        self._before = np.empty(0)
         self._least = pose_estimator.config.sure
 
     def estimate(
@@ -102,7 +104,8 @@ class StateEstimator:
         self.touches = any(contact)
         self._touched |= self.touches
         away = np.linalg.norm(observation[ft.TCP_POSE][:3] - self._start[:3])
-        if not self._touched and observation is not first and away > _NEAREST:
+        nearest = _HIDES if self._misled else _NEAREST
+        if not self._touched and observation is not first and away > nearest:
             self._look_again(observation)
         return {ft.TRUTH_CONTACT: np.array(contact, np.float32), ft.TRUTH_START: self._start}
 
@@ -134,7 +137,8 @@ class StateEstimator:
         self._start = self._latest = _unit_yaw(look.start[0].numpy())
         self._check_camera(look, first)
         self._contact = {key: ContactDetector(Background(first[key][None])) for key in ft.TACTILE}
-        self._first, self._touched = first, False
+        self._first, self._touched, self._misled = first, False, False
+        self._before = np.full(2, np.inf)  # where the object was before it moved
 
     def _seen(self, images: Images) -> str:
         names = ", ".join(self.pose_estimator.seen(images)) or "nothing that it knows"
@@ -155,6 +159,8 @@ class StateEstimator:
         moved = np.linalg.norm(now[:2] - self._start[:2]) > _MOVED
         if moved and np.linalg.norm(now[:2] - before[:2]) < _AGREE:
             object_ = _unit_yaw((now + before) / 2)[:_OBJECT]
+            self._misled |= bool(np.linalg.norm(object_[:2] - self._before) < _BACK)
+            self._before = self._start[:2]
             self._start = np.concatenate([object_, self._start[_OBJECT:]])
             self._places = look.places
 
