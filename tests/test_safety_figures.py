@@ -20,7 +20,7 @@ from touchgoal.control.safety.action_filter import (
     SafetyState,
     Watchdogs,
 )
-from touchgoal.control.safety.fingertip_health import FingertipHealth, image_fault, usual_light
+from touchgoal.control.safety.fingertip_health import FingertipHealth
 from touchgoal.control.safety.limits import Box
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
@@ -194,7 +194,7 @@ def test_which_images_of_a_fingertip_are_faulty_and_how_many_are_borne() -> None
 
     def fault(*columns: float) -> str:
         row = np.resize(np.array(columns, np.uint8), 320)[:, None]
-        return image_fault(np.tile(row, (240, 1, 3)), usual_light(GELSIGHT_MINI))
+        return FingertipHealth(GELSIGHT_MINI).fault(np.tile(row, (240, 1, 3)))
 
     dark = 0.3 * usual.mean()
     assert not any((fault(np.ceil(dark)), fault(245), fault(100, 106)))

@@ -12,7 +12,7 @@ from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.interfaces import ArmReading, DriverError, Frame, GripperReading, LoadReading
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_vector
-from touchgoal.control.safety.fingertip_health import FingertipHealth, image_fault, usual_light
+from touchgoal.control.safety.fingertip_health import FingertipHealth
 from touchgoal.control.tactile.indentation import IndentationMeter
 from touchgoal.runtime.errors import UserError
 
@@ -52,10 +52,10 @@ class ObservationReader:
         robot = connection.robot
         self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
         tips = connection.fingertips
-        for key, tip in tips.items():
-            if wrong := image_fault(tip.read().image, usual_light(tip.model)):
-                raise UserError(f"{key.removeprefix(ft.IMAGE_PREFIX)}: {wrong}")
         self._health = {key: FingertipHealth(tip.model) for key, tip in tips.items()}
+        for key, tip in tips.items():
+            if wrong := self._health[key].fault(tip.read().image):
+                raise UserError(f"{key.removeprefix(ft.IMAGE_PREFIX)}: {wrong}")
         self._meters = {
             key: IndentationMeter(tip.model, tip.read().image) for key, tip in tips.items()
         }

@@ -23,7 +23,8 @@ class FingertipHealth:
     """Health of one fingertip, followed frame by frame."""
 
     def __init__(self, sensor: SensorModel) -> None:
-        self._usual, self._parts = usual_light(sensor), FrozenParts()
+        self._parts = FrozenParts()
+        self._usual = float(load(sensor.sensor_file).background.mean())  # counts, untouched
         self._frames = self._bad = 0
 
     @property
@@ -36,29 +37,22 @@ class FingertipHealth:
         self._frames += 1
         if self._frames - self._parts.update(frame, self._frames) >= _STILL:
             return "its image or a part of it stands still: check its cable and driver"
-        wrong = image_fault(frame, self._usual)
+        wrong = self.fault(frame)
         self._bad = self._bad + 1 if wrong else 0
         return wrong if self._bad >= _CONFIRMING else ""
 
-
-def usual_light(sensor: SensorModel) -> float:
-    """Return the mean of a sensor's untouched image, counts."""
-    return float(load(sensor.sensor_file).background.mean())
-
-
-def image_fault(frame: Image, usual: float) -> str:
-    """Return what is wrong with one RGB image of a fingertip, touched or not; "" if nothing.
-
-    `usual` is the sensor's `usual_light`.
-    """
-    light = sum(cv2.sumElems(frame)) / frame.size
-    if light < _DARK * usual:
-        return "its image is black: check its light and cable"
-    if light > _BRIGHT:
-        return "its image is overexposed: check its exposure"
-    if (noise := _noise(frame)) > _NOISY:
-        return f"its image is noise ({noise:.0f} counts, a sensor's is below 5): check its cable"
-    return ""
+    def fault(self, frame: Image) -> str:
+        """Return what is wrong with one RGB image, touched or not; "" if nothing."""
+        light = sum(cv2.sumElems(frame)) / frame.size
+        if light < _DARK * self._usual:
+            return "its image is black: check its light and cable"
+        if light > _BRIGHT:
+            return "its image is overexposed: check its exposure"
+        if (noise := _noise(frame)) > _NOISY:
+            return (
+                f"its image is noise ({noise:.0f} counts, a sensor's is below 5): check its cable"
+            )
+        return ""
 
 
 def _noise(frame: Image) -> float:
