@@ -92,10 +92,15 @@ def test_a_hand_that_starts_elsewhere_than_in_training_is_refused() -> None:
 GEL = np.full((120, 160, 3), 90, np.uint8)
 FIRST = dict.fromkeys(ft.TACTILE, GEL) | {ft.FRONT: np.zeros((32, 32, 3), np.uint8)}
 TOUCH = dict.fromkeys(ft.TACTILE, cv2.circle(GEL.copy(), (80, 60), 20, (190, 20, 140), -1))
+FAR, NEAR = 0.3, 0.07  # m of the hand over the table
 
 
-def sees(now: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> StateEstimator:
-    """Return an estimator that sees the object at `x`, as `sure` as that."""
+def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two looks must agree; an unsure one counts for nothing, a first one ends it.
+
+    A hand that hides the object misleads once.
+    """
+    now = {"x": 0.0, "sure": 1.0}
 
     def look(*_: object) -> Look:
         start = torch.tensor([[now["x"], 0, 0, 1, 0, 0.3, 0.3]])
@@ -103,32 +108,24 @@ def sees(now: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> StateEstimat
         return Look(start, sure, one, one, {})
 
     monkeypatch.setattr(PoseEstimator, "look", look)
-    return StateEstimator(PoseEstimator(replace(SMALL, sure=(0.3, 0.3, 0.5, 0.5))).eval())
+    estimator = StateEstimator(PoseEstimator(replace(SMALL, sure=(0.3, 0.3, 0.5, 0.5))).eval())
 
+    def followed(*steps: tuple[float, float, float, dict]) -> list[float]:
+        ticks, seen = [], []
+        for now["x"], now["sure"], height, more in steps:
+            ticks.append({**FIRST, ft.TCP_POSE: np.eye(7, dtype=np.float32)[2] * height, **more})
+            seen.append(float(estimator.estimate(ticks[-1], ticks[0])[ft.TRUTH_START][0]))
+        return seen
 
-def test_a_moved_object_is_followed_until_the_first_touch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two looks must agree; a look that is not sure counts for nothing, a first one ends it."""
-    now = {"x": 0.0, "sure": 1.0}
-    estimator, first = sees(now, monkeypatch), FIRST | {ft.TCP_POSE: np.full(7, 0.3, np.float32)}
-    seen = []
-    steps = ((0.0, 1.0, {}), (0.5, 0.1, {}), *[(0.5, 1.0, {})] * 2, *[(0.9, 1.0, TOUCH)] * 2)
-    for now["x"], now["sure"], more in steps:
-        tick = {**first, **more} if seen else first
-        seen.append(estimator.estimate(tick, first)[ft.TRUTH_START][0])
-    assert seen == pytest.approx([0, 0, 0, 0.5, 0.5, 0.5])
-    now["sure"] = 0.2
+    here, away = (0.0, 1.0, FAR, {}), (0.5, 1.0, FAR, {})
+    touched = (0.9, 1.0, FAR, TOUCH)
+    found = followed(here, (0.5, 0.1, FAR, {}), away, away, touched, touched)
+    assert found == pytest.approx([0, 0, 0, 0.5, 0.5, 0.5])
+    near = (0.02, 1.0, NEAR, {})
+    found = followed(here, *(near, near, here, here) * 2)
+    assert found == pytest.approx([0, 0, 0.02, 0.02, 0, 0, 0, 0, 0])
     with pytest.raises(RefusedError, match="where the object is .0.20 sure, 0.30 needed"):
-        estimator.estimate(dict(first), dict(first))
-
-
-def test_a_hand_that_hides_the_object_misleads_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, seen = {"x": 0.0, "sure": 1.0}, []
-    estimator, first = sees(now, monkeypatch), {}
-    for now["x"], height in [(0.0, 0.3), *[(0.02, 0.07), (0.02, 0.07), (0.0, 0.2), (0.0, 0.2)] * 2]:
-        tick = FIRST | {ft.TCP_POSE: np.array([0, 0, height, 0, 1, 0, 0], np.float32)}
-        first = first or tick
-        seen.append(estimator.estimate(tick, first)[ft.TRUTH_START][0])
-    assert seen == pytest.approx([0, 0, 0.02, 0.02, 0, 0, 0, 0, 0])
+        followed((0.0, 0.2, FAR, {}))
 
 
 def test_a_hand_tilted_by_a_thousandth_changes_no_estimate() -> None:
@@ -184,18 +181,16 @@ def test_a_box_that_looks_turned_in_two_ways_is_turned_as_the_surest_crop_says()
     sight, lit = PoseEstimator(SMALL).eval(), {ft.FRONT: torch.zeros(1, 32, 32, 3).byte()}
 
     def scaled(_: object, scene: torch.Tensor, places: dict[str, torch.Tensor]) -> torch.Tensor:
-        start = torch.ones(len(scene), 7)  # in both ways, but for one crop
-        start[:, 3:5] = torch.tensor([0.0, 0.1])
-        start[places[ft.FRONT][:, 0].eq(torch.tensor([10.0, 13.0])).all(1), 4] = -0.9
-        return start
+        sure = places[ft.FRONT][:, 0].eq(torch.tensor([10.0, 13.0])).all(1)
+        return torch.ones(len(scene), 7) * torch.where(sure, -0.9, 0.1)[:, None]
 
     sight.scaled = scaled  # type: ignore[method-assign]
     start, one = torch.tensor([[0.5, 0.1, 0.02, 0.1, 0.0, 0.4, 0.2]]), torch.ones(1)
     look = Look(start, torch.ones(1, 2), start[:, 3], one, {ft.FRONT: torch.full((1, 2, 2), 16.0)})
     found = sight.turned_surely(lit, torch.zeros(1, 4), look)
-    assert found.turned.item() == pytest.approx(0.9)
-    yaw = torch.tensor([[0.0, -0.9]])
-    torch.testing.assert_close(found.start, torch.cat([start[:, :3], yaw, start[:, 5:]], 1))
+    assert found.turned.item() == pytest.approx(0.9 * 2**0.5)
+    start[:, 3:5] = -0.9
+    torch.testing.assert_close(found.start, start)
 
 
 def test_a_sentence_fits_its_object_alone() -> None:

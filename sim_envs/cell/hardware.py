@@ -82,15 +82,6 @@ class SimulatedHardware(ABC):
         """Take set-points beyond `setpoint_range`, to which feed-forward leads; the drive checks."""
         self.model.actuator_ctrllimited[: self.n_joints] = 0
 
-    def use_torque_control(self, on: bool) -> None:
-        """Leave the joints to `data.qfrc_applied` alone, without servo and friction, or end that."""
-        model, n, dofs = self.model, self.n_joints, self.arm_dofs
-        gain, bias, friction = (0.0, 0.0, 0.0) if on else self._servo
-        model.actuator_gainprm[:n], model.actuator_biasprm[:n] = gain, bias
-        model.dof_frictionloss[dofs] = friction
-        if not on:
-            self.data.qfrc_applied[dofs] = 0.0
-
     def update_contacts(self) -> None:
         """Recompute contacts and poses from the state."""
         mujoco.mj_forward(self.model, self.data)
@@ -214,11 +205,6 @@ class SimulatedHardware(ABC):
         gripper = model.actuator("gripper").id
         self._finger_stiffness = float(model.actuator_gainprm[gripper, 0])
         self._timestep = model.opt.timestep
-        self._servo = (
-            model.actuator_gainprm[: self.n_joints].copy(),
-            model.actuator_biasprm[: self.n_joints].copy(),
-            model.dof_frictionloss[self.arm_dofs],
-        )
         # Views, for what every set-point reads or writes.
         self._gripper_force = model.actuator_forcerange[gripper]
         self._arm_control = self.data.ctrl[: self.n_joints]

@@ -54,7 +54,7 @@ class SimulatedCell:
     """A task's cell, advanced a millisecond at a time and judged once a control tick.
 
     The arm is position controlled with velocity feed-forward, so that it follows its set-point
-    without the servo's lag, or torque controlled, without friction, as a Franka's torque loop is.
+    without the servo's lag.
     """
 
     def __init__(self, env: FrankaTactileEnv, seed: int, wrench_error: bool = True) -> None:
@@ -70,7 +70,6 @@ class SimulatedCell:
         env.release_setpoints()
         self._scratch = mujoco.MjData(model)
         self._hand, self._tcp = model.body("hand").id, model.site("tcp").id
-        self._torque: Joints | None = None
         self._braking: Joints | None = None
         self._yielding = False
         self._nudge_force, self._nudged_until = np.zeros(3), 0.0
@@ -98,21 +97,12 @@ class SimulatedCell:
 
     def set_target(self, q_d: Joints, dq_d: Joints) -> None:
         """Command joint positions `q_d` (rad), moving with `dq_d` (rad/s)."""
-        self._enter_control_mode(torque=False)
+        self._braking, self._yielding = None, False
         self.q_d, self.dq_d = q_d, dq_d
-
-    def set_torque(self, torque: Joints) -> None:
-        """Apply torques (N m) to the joints, on top of gravity compensation."""
-        if self._torque is None:
-            self._enter_control_mode(torque=True)
-        self._torque = torque
 
     def brake(self, acceleration: Joints) -> None:
         """Bring the set-point to rest, by rad/s^2 for each joint."""
-        if self._torque is not None:
-            self.q_d, self.dq_d = self.q.copy(), self.dq.copy()
-        self._enter_control_mode(torque=False)
-        self._braking = acceleration
+        self._braking, self._yielding = acceleration, False
 
     def give_way(self) -> None:
         """Stop here, as hard as a reflex does, and then give way to what presses."""
@@ -155,9 +145,6 @@ class SimulatedCell:
             self.q_d = self.q_d + DT * self.dq_d + given_way
         pushed = self._apply_nudge()
         env.grasp_force = self.gripper_command.force
-        if self._torque is not None:
-            env.data.qfrc_applied[env.arm_dofs] = self._torque
-            self.q_d, self.dq_d = self.q, self.dq
         joints, gripper = self.q_d + SERVO_DAMPING * self.dq_d, self.gripper_command
         env.step_physics(joints, gripper.width, gripper.speed)
         self.steps += 1
@@ -185,8 +172,7 @@ class SimulatedCell:
     def joint_torque(self) -> Joints:
         """Torque (N m) of each joint's drive, gravity compensation included."""
         data, dofs = self.env.data, self.env.arm_dofs
-        driven = data.qfrc_actuator[dofs] + data.qfrc_applied[dofs]
-        return driven + data.qfrc_gravcomp[dofs]
+        return data.qfrc_actuator[dofs] + data.qfrc_gravcomp[dofs]
 
     def kinematics(
         self, q: Joints, offset: Float[np.ndarray, "3"] = _NO_OFFSET
@@ -243,14 +229,6 @@ class SimulatedCell:
         worst.excess, worst.speed = max(worst.excess, self.excess), max(worst.speed, self.speed)
         if fastest > AT_REST:
             self._rest_since = self.time
-
-    def _enter_control_mode(self, torque: bool) -> None:
-        """End braking and yielding; switch between position servo and torque control."""
-        self._braking, self._yielding = None, False
-        if torque == (self._torque is not None):
-            return
-        self.env.use_torque_control(torque)
-        self._torque = None
 
 
 @njit(cache=True)

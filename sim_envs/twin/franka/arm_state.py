@@ -52,9 +52,7 @@ class ArmState:
         record["m_ee"], record["I_ee"] = 0.73, np.diag([0.001, 0.0025, 0.0017]).ravel()  # fr3.xml
         record["F_x_Cee"] = [-0.01, 0.0, 0.03]
 
-    def write_joints(
-        self, cell: SimulatedCell, ddq_d: limits.Joints, torque: limits.Joints, nonsense: bool
-    ) -> None:
+    def write_joints(self, cell: SimulatedCell, ddq_d: limits.Joints, nonsense: bool) -> None:
         """Write measured and commanded joints; with `nonsense` joint speeds are NaN."""
         fields = self.fields
         fields["q"][:] = fields["theta"][:] = q = cell.q
@@ -62,7 +60,7 @@ class ArmState:
         fields["dq"][:] = np.nan if nonsense else dq
         fields["q_d"][:] = q_d = cell.q_d
         fields["dq_d"][:], fields["ddq_d"][:] = cell.dq_d, ddq_d
-        fields["tau_J"][:], fields["tau_J_d"][:] = cell.joint_torque, torque
+        fields["tau_J"][:] = cell.joint_torque
         fields["elbow"][:] = q[2], np.sign(q[3])
         fields["elbow_d"][:] = fields["elbow_c"][:] = q_d[2], np.sign(q_d[3])
 
@@ -97,7 +95,7 @@ class ArmState:
             fields["reflex_reason"][:] = fields["errors"]
         fields["robot_mode"][:] = RobotMode.MOVE if motion else mode
         fields["controller_mode"][:] = motion.controller if motion else OTHER
-        # A state counts generators from 1: 0 is idle, 5 is none (torque control).
+        # A state counts generators from 1: 0 is idle.
         fields["motion_generator_mode"][:] = motion.generator + 1 if motion else 0
         fields["control_command_success_rate"][:] = success_rate if motion else 0.0
 

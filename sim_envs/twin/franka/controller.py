@@ -1,7 +1,8 @@
-"""The arm's side of the Franka control interface, in front of the cell, for any libfranka client.
+"""The arm's side of the Franka control interface, in front of the cell, for libfranka's joint motions.
 
-Reflexes, limits and lost packets abort motions with a real arm's errors. Not simulated: impedances
-set by the client (the servo keeps Franka's default), self-collision, guiding.
+Reflexes, limits and lost packets abort motions with a real arm's errors. Not simulated: Cartesian motions and
+torques, which are rejected; impedances set by the client (the servo keeps Franka's default), self-collision,
+guiding.
 """
 
 import time
@@ -9,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.limits import FR3
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
@@ -21,8 +21,8 @@ from touchgoal.sim_envs.twin.franka.messages import MoveStatus, RobotCommand, Ro
 from touchgoal.sim_envs.twin.tcp_ports import Service
 
 _MAX_LOST_PACKETS = 20  # packets in a row after which the arm stops: Franka's documentation
-_POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none
-_EXTERNAL = 2  # controller: torque; the others are the robot's own
+_POSITION, _VELOCITY = range(2)  # motion generators of joints; later ones are Cartesian
+_TORQUES = 2  # controller of a client's torques; the others are the robot's own
 _SETTERS = {*range(RobotCommand.SET_COLLISION_BEHAVIOUR, RobotCommand.SET_LOAD + 1)}
 # s between states while time stands, to a client without a motion, with a motion that begins, and
 # with one under way (libfranka gives up after 1 s).
@@ -210,11 +210,9 @@ class FrankaArm(Service):
             self.link.answer(request, status)
             return
         controller, generator = (int(n) for n in np.frombuffer(request.payload, "<u4", 2))
-        if controller > OTHER or (controller != _EXTERNAL and generator > _TWIST):
+        if controller > OTHER or controller == _TORQUES or generator > _VELOCITY:
             self.link.answer(request, MoveStatus.INVALID_ARGUMENT)
             return
-        if controller == _EXTERNAL:
-            generator = _TORQUE
         self._motion, self._success_rate = Motion(request, generator, controller), 1.0
         self.cell.set_target(self.cell.q_d.copy(), np.zeros(7))
         self._reset_setpoint()
@@ -241,9 +239,9 @@ class FrankaArm(Service):
         self._success_rate += 0.01 * ((not lost) - self._success_rate)
         if motion.lost > _MAX_LOST_PACKETS:
             self.abort("communication_constraints_violation")
-        elif lost and motion.generator != _TORQUE:
+        elif lost:
             last = self._setpoint  # a lost packet: acceleration stays (Franka's documentation)
-            self._go_to(motion, last.q + DT * (last.dq + DT * last.ddq))
+            self._go_to(last.q + DT * (last.dq + DT * last.ddq))
 
     def _take_messages(self) -> Motion | None:
         """Take requests and set-points; return the motion, which ends with its client."""
@@ -269,69 +267,32 @@ class FrankaArm(Service):
 
     def _apply_order(self, motion: Motion, order: np.void) -> None:
         motion.begun, motion.lost = True, 0
-        if order["finished"] or order["torque_finished"]:
+        if order["finished"]:
             self._end(MoveStatus.SUCCESS)
-        elif motion.generator == _TORQUE:
-            torque = order["tau_J_d"].copy()
-            fault = limits.torque_fault(self._torque, torque)
-            if fault is not None:
-                self.abort(fault)
-                return
-            self._torque = torque
-            self.cell.set_torque(torque)
         elif motion.generator == _POSITION:
-            self._go_to(motion, order["q_c"].copy())
-        elif motion.generator == _VELOCITY:
-            self._go_to(motion, self._setpoint.q + DT * order["dq_c"])
+            self._go_to(order["q_c"].copy())
         else:
-            self._go_by_tcp(motion, order)
+            self._go_to(self._setpoint.q + DT * order["dq_c"])
 
-    def _go_to(self, motion: Motion, q: np.ndarray) -> None:
+    def _go_to(self, q: np.ndarray) -> None:
         now = limits.next_setpoint(self._setpoint, q)
-        fault = limits.joint_fault(self._setpoint, now, motion.generator in (_POSE, _TWIST))
+        fault = limits.joint_fault(self._setpoint, now)
         if fault is not None:
             self.abort(fault)
             return
         self._setpoint = now
         self.cell.set_target(now.q, now.dq)
 
-    def _go_by_tcp(self, motion: Motion, order: np.void) -> None:
-        """Step from the last set-point by differential inverse kinematics."""
-        q = self._setpoint.q
-        now, jacobian = end_effector(self.cell, self._ee, q)
-        if motion.generator == _POSE:
-            target = order["O_T_EE_c"].reshape(4, 4).T
-            R = target[:3, :3]
-            if not np.isfinite(target).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
-                self.abort("cartesian_position_motion_generator_invalid_frame")
-                return
-            error = np.concatenate([target[:3, 3] - now[:3, 3], rotation_vector(R @ now[:3, :3].T)])
-            twist = error / DT
-        else:
-            twist = order["O_dP_EE_c"]
-        fault = limits.tcp_fault(twist)
-        if fault is not None:
-            self.abort(fault)
-            return
-        inverse = np.linalg.solve(jacobian @ jacobian.T + limits.DAMPING * np.eye(6), jacobian).T
-        step = inverse @ (DT * twist)
-        if order["valid_elbow"]:
-            null = np.eye(7) - inverse @ jacobian
-            # The third joint is the elbow; a tenth of what is missing at a time keeps it smooth.
-            step = step + null[:, 2] * 0.1 * (order["elbow_c"][0] - q[2] - step[2])
-        self._go_to(motion, q + step)
-
     # State.
 
     def _load_code(self) -> None:
         contact = self._estimate_wrench()
         self._state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
-        limits.joint_fault(self._setpoint, self._setpoint, cartesian=False)
+        limits.joint_fault(self._setpoint, self._setpoint)
 
     def _reset_setpoint(self) -> None:
         zero = np.zeros(7)
         self._setpoint = Setpoint(self.cell.q_d.copy(), zero, zero)
-        self._torque = zero
 
     def _estimate_wrench(self) -> limits.Contact:
         self._pose, jacobian = end_effector(self.cell, self._ee, self.cell.q)
@@ -343,7 +304,7 @@ class FrankaArm(Service):
     def _send_state(self, contact: limits.Contact) -> None:
         state = self._state
         state.fields["message_id"][:] = self._sent
-        state.write_joints(self.cell, self._setpoint.ddq, self._torque, self.nonsense)
+        state.write_joints(self.cell, self._setpoint.ddq, self.nonsense)
         state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
         state.write_mode(self.mode, self.error, self._motion, self._success_rate)
         self.link.send(state.record.tobytes())

@@ -14,14 +14,11 @@ from touchgoal.sim_envs.twin.franka.messages import COLLISION_BEHAVIOUR
 Joints = Float[np.ndarray, "7"]
 Wrench = Float[np.ndarray, "6"]
 
-# libfranka rate_limiting.h and Franka's documentation of the FR3: m/s and rad/s of the TCP; N m/s.
-_TCP_SPEED, _TCP_TURN, _TORQUE_RATE = 3.0, 2.5, 1000.0
-TORQUE = np.array([87.0] * 4 + [12.0] * 3)  # N m
 _SLACK = 1.01  # for the wire's rounding
 _STEADY = 0.1  # rad/s^2: below it the thresholds for nominal motion hold
 # Singular value of the Jacobian below which the arm gives no wrench; our choice.
 _SINGULAR = 0.02
-DAMPING = 1e-8  # m^2: makes the wrench at a singular pose finite
+_DAMPING = 1e-8  # m^2: makes the wrench at a singular pose finite
 _NEVER_ZERO = 1e-6  # N: a measured estimate is never exactly 0
 
 
@@ -49,16 +46,10 @@ def next_setpoint(before: Setpoint, q: Joints) -> Setpoint:
     return Setpoint(q, dq, (dq - before.dq) / DT)
 
 
-def joint_fault(before: Setpoint, now: Setpoint, cartesian: bool) -> str | None:
-    """Return libfranka's name of the limit that a set-point breaks; None if none.
-
-    Cartesian ones, through the twin's own inverse kinematics, are held to range and speed only.
-    """
-    name = "cartesian_motion_generator_joint" if cartesian else "joint_motion_generator"
+def joint_fault(before: Setpoint, now: Setpoint) -> str | None:
+    """Return libfranka's name of the limit that a set-point breaks; None if none."""
     broken = _broken_limit(now.q, now.dq, now.ddq, before.ddq, *_HARDWARE)
-    if broken < 0 or (cartesian and broken > _SPEED):
-        return None
-    return f"{name}_{_LIMITS[broken]}"
+    return None if broken < 0 else f"joint_motion_generator_{_LIMITS[broken]}"
 
 
 _LIMITS = (
@@ -67,7 +58,6 @@ _LIMITS = (
     "velocity_discontinuity",
     "acceleration_discontinuity",
 )
-_SPEED = 1  # index of the last limit that holds for Cartesian set-points
 
 
 @njit(cache=True)
@@ -91,23 +81,6 @@ def _broken_limit(
         elif abs(ddq[i] - ddq_before[i]) > _SLACK * DT * jerk[i]:
             worst = min(worst, 3)
     return worst if worst < len(_LIMITS) else -1
-
-
-def tcp_fault(twist: Wrench) -> str | None:
-    """Return a fault if a Cartesian set-point (m/s, rad/s) is too fast."""
-    slow = np.linalg.norm(twist[:3]) <= _SLACK * _TCP_SPEED
-    if not slow or not np.linalg.norm(twist[3:]) <= _SLACK * _TCP_TURN:
-        return "cartesian_motion_generator_velocity_limits_violation"
-    return None
-
-
-def torque_fault(before: Joints, now: Joints) -> str | None:
-    """Return the limit that commanded torques (Nm) break; None if none."""
-    if not (np.abs(now) <= _SLACK * TORQUE).all():
-        return "tau_j_range_violation"
-    if not (np.abs(now - before) <= _SLACK * DT * _TORQUE_RATE).all():
-        return "controller_torque_discontinuity"
-    return None
 
 
 def arm_fault(excess: float, speed: float) -> str | None:
@@ -165,4 +138,4 @@ def judge_contact(
 @no_type_check
 def wrench_from_torques(torque: Joints, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
     """Return the wrench (N, Nm) that best explains joint torques (Nm)."""
-    return np.linalg.solve(jacobian @ jacobian.T + DAMPING * np.eye(6), jacobian @ torque)
+    return np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(6), jacobian @ torque)
