@@ -40,9 +40,9 @@ _YAW = slice(3, 5)  # cosine and sine of twice the grasp's yaw
 _OBJECT = 5  # numbers of `features.TRUTH_START` on the object
 _SHOW = "put objects and disc in view, and say which one is meant (--target)"
 _ASKED = {  # and what to do
-    **dict.fromkeys(
-        ("where the object is", "where the disc is", "how the object is turned"), _SHOW
-    ),
+    "where the object is": _SHOW,
+    "where the disc is": _SHOW,
+    "how the object is turned": _SHOW,
     "which side is left": "it may be mirrored: let the camera send images as they are",
 }
 # m. The object has moved if two later estimates agree within the first distance and lie the second

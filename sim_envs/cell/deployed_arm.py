@@ -26,7 +26,7 @@ _ARRIVED = 1e-3  # m
 _STILL = 2e-4  # m; fingers that move less between two looks have stopped
 _LEAST = 2  # looks before a command can end
 _AHEAD = 10  # ticks for which delays are drawn beyond an episode's end
-_REST = 200  # further ticks, of the last one's delay: an arm may rest after the end
+_REST = 10.0  # s for which an arm may rest after that; then delays are the last tick's
 
 Joints = Float[np.ndarray, " n"]
 Value = TypeVar("Value")
@@ -135,7 +135,7 @@ class DeployedArm:
         delays = _delays(rng, deployment.command_delay, jitter, ticks)
         # A command never overtakes the one before it.
         self._arrives = np.maximum.accumulate(np.arange(ticks) * self._tick_ms + delays)
-        after = self._tick_ms * np.arange(1, _REST + 1)
+        after = self._tick_ms * np.arange(1, round((_REST + hardware.config.rest) * hz) + 1)
         self._state_at, self._image_at, self._arrives = (
             np.append(at, at[-1] + after) for at in (self._state_at, self._image_at, self._arrives)
         )
