@@ -2,8 +2,8 @@
 
 A scripted device leads the arm of a twin to put a block on a disc; a policy learns it by sight, runs, and is
 trained on what is accepted as well: by a judge that is fitted on the demonstrations alone, by the twin's
-truth, or all of it. The judge ends the runs, whatever accepts them. The first round's runs are the same in all.
-What the folder of an earlier run holds is taken from there.
+truth, or all of it. The judge ends the runs, whatever accepts them. The first round's runs are the same in all,
+and say how good the policy was before. What the folder of an earlier run holds is taken from there.
 """
 
 import shutil
@@ -50,15 +50,13 @@ class Config(BenchmarkOptions):
     rounds: Count = 3
     """Rounds of runs and training."""
     runs: Count = 20
-    """Runs in each round."""
-    trials: Count = 20
-    """Deployments of the policy before and of those after, on other scenes."""
+    """Runs in each round; as many deployments on other scenes try each policy in the end."""
     seconds: Positive = 30.0
     """Time limit of a run, s."""
     train: str = "--preset sight"
     """Options of train-policy."""
     workers: Count = CORES
-    """Filters side by side; twins of the trials before."""
+    """Twins side by side."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +108,9 @@ class _Lab:
             known.append(true)
             write_json(file, known)
 
-    def success(self, policy: Path, twins: int = 1) -> SuccessRate:
+    def success(self, policy: Path, twins: int) -> SuccessRate:
         """Return the success of a policy in the trials, which several twins share."""
-        file, last = policy.parent / "trials.json", _TRIED + self.config.trials
+        file, last = policy.parent / "trials.json", _TRIED + self.config.runs
 
         def tried(k: int) -> list[bool]:
             lab = replace(self, number=self.number + len(get_args(Filter)) * k)
@@ -159,6 +157,8 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
     for name in config.filters:
         go_on_from(first.out, out / name)
 
+    twins = max(1, config.workers // len(config.filters))
+
     def improved(job: tuple[int, Filter]) -> dict[str, Any]:
         own = _Lab(config, out, 1 + job[0])
         work = own.improve(job[1], data, validation, config.rounds)
@@ -166,15 +166,15 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
         true = parse_json((work.out / _TRUTH).read_bytes())
         accepted = [t for t, v in zip(true, said, strict=True) if v == "success"]
         return {
-            "successes": own.success(work.policy(config.rounds)).successes,
+            "successes": own.success(work.policy(config.rounds), twins).successes,
             "accepted": len(accepted),
             "right": float(np.mean(accepted)) if accepted else 0.0,
             "rounds": [sum(true[i : i + config.runs]) for i in range(0, len(true), config.runs)],
         }
 
-    before = lab.success(first.policy(0), config.workers)
     with ThreadPoolExecutor(config.workers) as pool:
         rows = dict(zip(config.filters, pool.map(improved, enumerate(config.filters)), strict=True))
+    before = SuccessRate(next(iter(rows.values()))["rounds"][0], config.runs)
     lines = [
         f"{config.demonstrations} demonstrations, {config.rounds} rounds of {config.runs} runs; "
         "success of policies in trials [95 % Wilson]",
@@ -183,12 +183,12 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
     ]
     for name, row in rows.items():
         after, each = (
-            SuccessRate(row["successes"], config.trials),
+            SuccessRate(row["successes"], config.runs),
             " ".join(map(str, row["rounds"])),
         )
         lines.append(f"{name:<8}{after!s:>22}{row['accepted']:>10}{row['right']:>15.0%}  {each}")
     found = {"before": [{"successes": before.successes}]} | {k: [v] for k, v in rows.items()}
-    return {"table": "\n".join(lines), "trials": config.trials, "imitation": found}
+    return {"table": "\n".join(lines), "trials": config.runs, "imitation": found}
 
 
 def go_on_from(first: Path, folder: Path) -> None:
