@@ -44,7 +44,7 @@ def moves(address: str, home: list[float]) -> dict:
 
     robot = connect(address)
 
-    def refused(motion: object) -> str:
+    def refused(motion: "franky.JointMotion | franky.CartesianMotion") -> str:
         try:
             robot.move(motion)
         except (franky.ControlException, franky.CommandException) as error:
