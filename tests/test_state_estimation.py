@@ -177,14 +177,14 @@ def test_of_two_objects_that_fit_equally_the_one_before_is_kept() -> None:
         torch.testing.assert_close(found, before[ft.FRONT], atol=0.1, rtol=0)
 
 
-def test_a_box_that_looks_turned_in_two_ways_is_turned_as_the_surest_crop_says() -> None:
+def test_the_surest_crop_says_how_a_box_is_turned(monkeypatch: pytest.MonkeyPatch) -> None:
     sight, lit = PoseEstimator(SMALL).eval(), {ft.FRONT: torch.zeros(1, 32, 32, 3).byte()}
 
     def scaled(_: object, scene: torch.Tensor, places: dict[str, torch.Tensor]) -> torch.Tensor:
         sure = places[ft.FRONT][:, 0].eq(torch.tensor([10.0, 13.0])).all(1)
         return torch.ones(len(scene), 7) * torch.where(sure, -0.9, 0.1)[:, None]
 
-    sight.scaled = scaled  # type: ignore[method-assign]
+    monkeypatch.setattr(sight, "scaled", scaled)
     start, one = torch.tensor([[0.5, 0.1, 0.02, 0.1, 0.0, 0.4, 0.2]]), torch.ones(1)
     look = Look(start, torch.ones(1, 2), start[:, 3], one, {ft.FRONT: torch.full((1, 2, 2), 16.0)})
     found = sight.turned_surely(lit, torch.zeros(1, 4), look)

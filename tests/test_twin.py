@@ -74,8 +74,8 @@ def moves(address: str, home: list[float]) -> dict:
     turned = np.array(robot.state.q) - before
     far = refused(franky.JointMotion([2.9, *home[1:]]))
     cartesian = refused(franky.CartesianMotion(franky.Affine([0, 0, 0.03])))
-    told = {"panda": panda, "far": far, "cartesian": cartesian}
-    return {"errors": errors, "turned": turned.tolist(), **told}
+    refusals = {"panda": panda, "far": far, "cartesian": cartesian}
+    return {"errors": errors, "turned": turned.tolist(), **refusals}
 
 
 @pytest.mark.realtime

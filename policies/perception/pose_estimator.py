@@ -25,7 +25,7 @@ _PARTS = (5, 2)  # numbers of `features.TRUTH_START` on the object and on the go
 _TCP = ft.FEATURES[ft.TCP_POSE].shape[0]
 _PATCH = 4  # px between two cells of a crop
 _CELL = 8  # px between two cells of a finder's map
-_MOVES = (-6.0, -3.0, 0.0, 3.0, 6.0)  # px
+_MOVES = (-6.0, -3.0, 0.0, 3.0, 6.0)  # px by which crops are moved along each axis
 _PEAK = 1.5  # cells around a map's maximum over which the place is averaged
 _NEAR, _LEAST_GAIN = 40.0, -1.5  # px; a clearly better place far away still wins
 # Centre of the first cell, px: that of the 8 pixels of its patch, which begin at -2.
