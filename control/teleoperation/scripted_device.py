@@ -27,6 +27,7 @@ _ASIDE = 0.04, 0.02, 0.008
 _TURNED = {"open": (0.8, 0.5, 0.1), "close": (0.1, 0.1, 0.1)}
 _MOST_TURNED = 1.8  # rad about the vertical that the arm reaches everywhere on the table
 _LOW = 0.06  # m; the fingertips are above what is grasped
+_LEFT = 0.12, 0.01  # m above what it let go, mean and standard deviation, where the hand stands still in the end
 _STILL_TICKS = 8  # ticks without motion: the hand has closed, or the table blocks it
 _STILL = 4e-4  # m of position and of width that count as no motion
 _PLACED = 0.015  # m between hand and goal
@@ -59,7 +60,8 @@ class ScriptedDevice(TeleoperationDevice):
         yield from self._go_down(put, "close")
         there = np.linalg.norm((self._position - put)[:2]) < _PLACED and self._width > _HELD
         yield from self._wait("open")
-        yield from self._go(self._above(put), 0.0, "open", _PASSED)
+        yield from self._go(put + [0, 0, self._rng.normal(*_LEFT)], 0.0, "open", _REACHED)
+        yield from self._wait("open")
         self.verdict = "done" if there else "not done"
         while True:
             yield HandMotion(np.zeros(6), "open")
