@@ -207,7 +207,7 @@ def test_own_demonstrations_train_a_policy_that_deploys(
         run(*deploying, "--task", "pick-place")
 
 
-def test_the_script_errs_on_its_way_down_and_corrects() -> None:
+def test_the_script_errs_on_its_way_down_corrects_and_stands_still_at_the_end() -> None:
     ends = np.array([[0.5, 0.1], [0.4, -0.1]])  # of block and disc
     for seed in (0, 1):
         device = ScriptedDevice(PickPlacePoses((*ends[0], 0.02, 0.3), tuple(ends[1])), seed)
@@ -217,8 +217,8 @@ def test_the_script_errs_on_its_way_down_and_corrects() -> None:
             motion = device.read({ft.TCP_POSE: pose, ft.STATE: np.array([width])})
             position = position + 0.01 * motion.twist[:3]
             R = rotation_matrix(0.05 * motion.twist[3:]) @ R
-            width = {"open": 0.08, "close": 0.03}[motion.gripper]
-            way.append([*position, width])
+            way.append([*position, width := {"open": 0.08, "close": 0.03}[motion.gripper]])
+        assert np.ptp(way[-7:], axis=0).max() < 4e-4 and way[-1][2] > 0.1  # it has left, and stands
         x_y, z, width = np.split(np.array(way), [2, 3], 1)
         np.testing.assert_allclose(x_y[(width < 0.05)[:, 0]][[0, -1]], ends, atol=0.005)
         low = np.abs(z[:, 0] - 0.09) < 0.01  # at the last way-point, 6 cm above the end
