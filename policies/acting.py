@@ -15,7 +15,6 @@ from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Planner
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.policies.heads.end import DONE_SECONDS
 from touchgoal.policies.network import NOVEL_SECONDS, ObservationBatch, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
@@ -159,9 +158,9 @@ class LearnedPolicy(Planner):
             plan = self._network.plan(batch, self._generator, self._width, self._key_pose)
             actions, done = plan.actions[0].numpy(), bool(plan.done[0])
             self._done_plans = self._done_plans + 1 if done else 0
-            if done and self._network.end is not None and self._network.end.stands:
-                actions[:, :-1] = 0.0
-            self.done = self._done_plans * self.execution_horizon >= DONE_SECONDS * self.control_hz
+            if (end := self._network.end) is not None:
+                actions[:, :-1] *= not (done and end.stands)
+                self.done = self._done_plans * self.execution_horizon >= end.seconds * self.control_hz
             # The last action of a plan comes a tick and `execution_horizon` ticks after its
             # observation. The whole motion is done where no age is known.
             reaction = (1 + self.execution_horizon) / self.control_hz

@@ -7,8 +7,9 @@ from torch import Tensor, nn
 from touchgoal.policies.heads.mlp import readout
 
 END_SECONDS = 0.5  # s at the end of a successful recording in which the task is done
-# s for which a policy must find it done: an object that hovers over its place looks nearly so.
-DONE_SECONDS = 0.8
+# s for which its probability must last in recordings, which stop soon after the end; for a policy this is
+# enough where they go on after success. Elsewhere an object that hovers over its place looks nearly done.
+LASTING, _DONE_SECONDS = 0.3, 0.8
 _WIDTH = 64
 
 
@@ -26,6 +27,11 @@ class EndOutput(nn.Module):
         # whether the recordings go on after success: no motion is taught there, so the arm stands still
         self.stands = nn.Buffer(torch.tensor(False))
         self.network = readout(inputs, _WIDTH, 1).requires_grad_(False)
+
+    @property
+    def seconds(self) -> float:
+        """Return for how long a policy must find the task done, s."""
+        return LASTING if self.stands else _DONE_SECONDS
 
     def scaled(self, condition: Float[Tensor, "b c"]) -> Float[Tensor, "b c"]:
         """Return what the network reads: of variance 1, without extremes."""

@@ -6,14 +6,13 @@ from accelerate.utils import send_to_device
 from jaxtyping import Float
 from torch import Tensor
 
-from touchgoal.policies.heads.end import EndOutput
+from touchgoal.policies.heads.end import LASTING, EndOutput
 from touchgoal.policies.network import PolicyNetwork
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 _STEPS, _PASSES, _BATCH = 1500, 100, 512  # steps and passes over the data at most
 _RATE, _DECAY, _NOISE = 1e-3, 1e-2, 0.1
 _ROWS = 1024  # windows that are encoded at once
-_LASTING = 0.3  # s for which a probability must last; recordings stop soon after the end
 _EARLY = 1.0  # s before a recording's end at which it is not done
 _LEAST_LIMIT = 0.5
 _LEAST_SHARE, _FEWEST = 0.5, 5  # share of the ends that must be noticed, of so many at least
@@ -56,7 +55,7 @@ def _set_limit(
     last, before = [], [_LEAST_LIMIT]
     found, lengths = end(_conditions(policy, validation)), list(recorded.lengths)
     for episode, done in zip(found.split(lengths), recorded.done.split(lengths), strict=True):
-        lasting = episode.unfold(0, min(round(_LASTING * hz), len(episode)), 1).amin(1)
+        lasting = episode.unfold(0, min(round(LASTING * hz), len(episode)), 1).amin(1)
         before += lasting[: -round(_EARLY * hz) if done[-1] else None].tolist()
         last += [lasting.max().item()] * bool(done[-1])
     limit = max(before)
