@@ -160,7 +160,9 @@ class LearnedPolicy(Planner):
             self._done_plans = self._done_plans + 1 if done else 0
             if (end := self._network.end) is not None:
                 actions[:, :-1] *= not (done and end.stands)
-                self.done = self._done_plans * self.execution_horizon >= end.seconds * self.control_hz
+                self.done = (
+                    self._done_plans * self.execution_horizon >= end.seconds * self.control_hz
+                )
             # The last action of a plan comes a tick and `execution_horizon` ticks after its
             # observation. The whole motion is done where no age is known.
             reaction = (1 + self.execution_horizon) / self.control_hz
