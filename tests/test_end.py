@@ -46,7 +46,7 @@ def test_a_policy_is_done_once_it_has_looked_so_for_a_while() -> None:
     assert said(LIFTED, 24)[-4:] == [True] * 4
     moved = actor.act(dict(tick))[:7].any()
     actor = LearnedPolicy(_fitted(LIFTED, goes_on=True)[0], None)
-    assert moved and said(LIFTED, 24)[-1] and not actor.act(dict(tick))[:7].any()
+    assert moved and said(LIFTED, 12)[-1] and not actor.act(dict(tick))[:7].any()
     actor.reset()
     assert not actor.done
 
