@@ -198,7 +198,7 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
     out = open_training(config, "train-encoder")
     method = type(config).__name__.lower()
     single = isinstance(config, Mae) and not config.mae.stacked
-    offsets = None if single else frame_offsets(SPARSH_BASE[method], config.stride)
+    offsets = (0,) if single else frame_offsets(SPARSH_BASE[method], config.stride)
     drawn = config.frames, config.seed, offsets
     train, val = touch.train(*drawn), touch.validation(*drawn)
     train_unlabelled(train, val, getattr(config, method), out, config, touch.recipe)

@@ -18,12 +18,12 @@ from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.infonce import info_nce, symmetric_info_nce
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS
-from touchgoal.encoders.preprocess import PREPROCESSORS, check_images
+from touchgoal.encoders.preprocess import check_images, preprocessor_for
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import portable
 
 ROOT = Path(__file__).parents[1]
-MINI = PREPROCESSORS["gelsight_mini"]
+MINI = preprocessor_for("gelsight_mini")
 
 
 @pytest.fixture(autouse=True)

@@ -29,13 +29,6 @@ def past_rows(
     return np.maximum(rows[:, None] - np.array(offsets), np.reshape(first, (-1, 1)))
 
 
-def stack_frames(
-    frames: Float[Tensor, "n t 3 h w"], vit: ViTConfig
-) -> Float[Tensor, "n c *clip h w"]:
-    """Stack frames, newest first, as channels of one image, or as a clip for tubelets."""
-    return frames.flatten(1, 2) if vit.tubelet == 1 else frames.transpose(1, 2)
-
-
 class RecentFrames:
     """Cache of the last preprocessed frames of one sensor, so that a tick preprocesses only one."""
 

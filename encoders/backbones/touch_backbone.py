@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor, nn
 
-from touchgoal.encoders.backbones.frame_history import frame_offsets, past_rows, stack_frames
+from touchgoal.encoders.backbones.frame_history import frame_offsets, past_rows
 from touchgoal.encoders.backbones.sparsh_input import SparshPreprocessor
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.preprocess import Preprocessor, check_images, preprocessor_for
@@ -180,5 +180,5 @@ class TouchBackbone(BaseTouchEncoder):
         return self.vit.features(touch, ids_keep)
 
     def stack(self, frames: Float[Tensor, "n t 3 h w"]) -> Float[Tensor, "n c *t h w"]:
-        """See BaseTouchEncoder."""
-        return stack_frames(frames, self.config.vit)
+        """Return frames as channels of one image, or as a clip for tubelets."""
+        return frames.flatten(1, 2) if self.config.vit.tubelet == 1 else frames.transpose(1, 2)

@@ -7,10 +7,9 @@ import copy
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor, nn
 
-from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.ssl.config import SelfDistillationConfig
 
@@ -65,7 +64,3 @@ class SelfDistillation(nn.Module):
         for average, module in self.averaged():
             update_average(average, module, momentum)
         self.step += 1
-
-    def stacked(self, touch: Tensor) -> Float[Tensor, "b c *t h w"]:
-        """Return the network's input from touches with the frames of each newest first."""
-        return stack_frames(touch.float(), self.backbone.config.vit)

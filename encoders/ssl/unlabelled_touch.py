@@ -15,8 +15,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import provenance
 
-Offsets = tuple[int, ...] | None
-Draw = Callable[[int, int, Offsets], frames.TouchFrames]
+Draw = Callable[[int, int, tuple[int, ...]], frames.TouchFrames]
 """Draws a number of samples from each episode or recording by a seed; see `sample_frames`."""
 
 
