@@ -97,8 +97,8 @@ def test_paper_preset_is_equation_2_and_the_default_adds_image_to_text() -> None
     image = (batch.touch[c] @ batch.image[c].T / 0.2).log_softmax(1).diagonal().mean()
     text = (batch.touch @ batch.text.T / 0.2).log_softmax(1).diagonal().mean()
     torch.testing.assert_close(paper["loss"], -image - text)
-    three = batch_losses(batch, False, replace(CONFIG, text_weight=0.5, image_text_weight=0.25))
-    weighted = 0.5 * three["loss_touch_text"] + 0.25 * three["loss_image_text"]
+    three = batch_losses(batch, False, replace(CONFIG, text_weight=0.5))
+    weighted = 0.5 * three["loss_touch_text"] + three["loss_image_text"]
     torch.testing.assert_close(three["loss"], weighted + three["loss_touch_image"])
 
 

@@ -4,13 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from touchgoal.control.arrays import Image
 from touchgoal.encoders.backbones.vit import ViTConfig
 from touchgoal.encoders.preprocess import Preprocessor
-
-Frame = UInt8[np.ndarray, "h w 3"]
 
 
 def frame_offsets(vit: ViTConfig, stride: int) -> tuple[int, ...]:
@@ -34,10 +33,10 @@ class RecentFrames:
 
     def __init__(self, preprocess: Preprocessor, offsets: tuple[int, ...]) -> None:
         self._preprocess, self._offsets = preprocess, offsets
-        self._untouched: Frame | None = None
-        self._known: list[tuple[Frame, Float[Tensor, "1 3 H W"]]] = []
+        self._untouched: Image | None = None
+        self._known: list[tuple[Image, Float[Tensor, "1 3 H W"]]] = []
 
-    def latest(self, history: Sequence[Frame], untouched: Frame) -> Float[Tensor, "1 t 3 H W"]:
+    def latest(self, history: Sequence[Image], untouched: Image) -> Float[Tensor, "1 t 3 H W"]:
         """Return the newest frame and those at the offsets before it, for an encoder's `stack`.
 
         The history holds the same objects from tick to tick, the oldest first, which also stands
@@ -51,7 +50,7 @@ class RecentFrames:
         self._known = [entry for entry in self._known if id(entry[0]) in held]
         return torch.stack(chosen, 1)
 
-    def _preprocessed(self, frame: Frame) -> Float[Tensor, "1 3 H W"]:
+    def _preprocessed(self, frame: Image) -> Float[Tensor, "1 3 H W"]:
         for known, touch in self._known:
             if known is frame:
                 return touch

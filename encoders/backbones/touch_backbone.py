@@ -38,12 +38,6 @@ class TouchBackboneConfig:
         """Return the width of an embedding."""
         return self.vit.width
 
-    def find_preprocessor(self) -> Preprocessor:
-        """Return the sensor's current preprocessor; UserError for an unknown sensor."""
-        if self.sensor is None:
-            return SparshPreprocessor.of(self.preprocessor, self.vit.image_size)
-        return preprocessor_for(self.sensor)
-
 
 class BaseTouchEncoder(nn.Module):
     """Interface of all touch encoders; subclasses turn preprocessed frames into embeddings.
@@ -168,8 +162,12 @@ class TouchBackbone(BaseTouchEncoder):
 
     def __init__(self, config: TouchBackboneConfig, vit: ViT | None = None) -> None:
         """Wrap a ViT, or a randomly initialised one; UserError for an unknown sensor."""
+        if config.sensor is None:
+            preprocess = SparshPreprocessor.of(config.preprocessor, config.vit.image_size)
+        else:
+            preprocess = preprocessor_for(config.sensor)
         offsets = frame_offsets(config.vit, config.stride)
-        super().__init__(config.find_preprocessor(), config.embedding_dim, offsets)
+        super().__init__(preprocess, config.embedding_dim, offsets)
         self.config = config
         self.vit = ViT(config.vit) if vit is None else vit
 
