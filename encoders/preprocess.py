@@ -11,6 +11,7 @@ from touchgoal.control.tactile.sensor_models import find_model
 from touchgoal.encoders.backbones.sparsh_input import SparshPreprocessor
 from touchgoal.runtime.errors import UserError
 
+SCALE = 16.0  # grey levels (of 255) that become 1.0; about the contrast of a firm contact
 _ASPECT_TOLERANCE = 0.02  # a GelSight Mini's own 3280 x 2464 differs from 4:3 by 0.2 %
 
 
@@ -25,9 +26,6 @@ class TactilePreprocessor:
     sensor: str  # `SensorModel.name`
     version: int  # version of the numbers
     size: tuple[int, int]  # height and width of the output, px
-    scale: float = (
-        16.0  # grey levels (of 255) that become 1.0; about the contrast of a firm contact
-    )
 
     @property
     def id(self) -> str:
@@ -52,7 +50,7 @@ class TactilePreprocessor:
         interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         untouched = background.astype(np.float32)
         for i, frame in enumerate(frames):
-            change = (remove_gain(frame, untouched) - untouched) / np.float32(self.scale)
+            change = (remove_gain(frame, untouched) - untouched) / np.float32(SCALE)
             out[i] = cv2.resize(change, (w, h), interpolation=interpolation).transpose(2, 0, 1)
         return out
 

@@ -213,11 +213,7 @@ def collect(
     the episodes in progress. The progress bar counts successes and names the commonest failure.
     Returns the `meta` of each episode, outcome and success included. UserError: nothing to record,
     the set cannot be continued, or another process records into it. NoSuccessError: the first
-    `max_failures` episodes failed; they are recorded.
-
-    Args:
-        roles: Actor and expert; must pickle.
-        max_failures: Stop after so many first episodes without a success; None for never.
+    `max_failures` episodes failed; they are recorded. `roles` must pickle.
     """
     if not specs:
         raise UserError("nothing to collect: ask for at least one episode")

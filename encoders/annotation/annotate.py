@@ -230,11 +230,8 @@ def deformations(touches: Iterable[Image], reference: Image) -> Float[np.ndarray
 def match_reference(sensor: Sequence[Box | None]) -> int:
     """Return the first frame in which the sensor does not cover the place that it will touch.
 
-    LeftOut: the sensor is lost at the contact, or covers the place in every frame.
-
-    Args:
-        sensor: The sensor's box in each camera frame up to the contact frame, the last; None where it is
-            not in view.
+    `sensor` is its box in each camera frame up to the contact frame, the last; None where it is not in
+    view. LeftOut: the sensor is lost at the contact, or covers the place in every frame.
     """
     contact = sensor[-1]
     if contact is None:
@@ -254,12 +251,7 @@ def select_instances(
 ) -> tuple[list[Detection], dict[str, int]]:
     """Return the objects among the detections, best first, and how many were dropped for what reason.
 
-    LeftOut: no object remains.
-
-    Args:
-        detections: Boxes in the reference frame.
-        sensor: The sensor's box in the reference frame; None if it is not in view.
-        min_score: Smallest confidence.
+    Boxes are in the reference frame; `sensor` is None if it is not in view. LeftOut: no object remains.
     """
     kept: list[Detection] = []
     dropped: Counter[str] = Counter()

@@ -34,7 +34,8 @@ class RecentFrames:
     def __init__(self, preprocess: Preprocessor, offsets: tuple[int, ...]) -> None:
         self._preprocess, self._offsets = preprocess, offsets
         self._untouched: Image | None = None
-        self._known: list[tuple[Image, Float[Tensor, "1 3 H W"]]] = []
+        # by the id of a frame, which is kept so that its id stays its own
+        self._known: dict[int, tuple[Image, Float[Tensor, "1 3 H W"]]] = {}
 
     def latest(self, history: Sequence[Image], untouched: Image) -> Float[Tensor, "1 t 3 H W"]:
         """Return the newest frame and those at the offsets before it, for an encoder's `stack`.
@@ -43,18 +44,13 @@ class RecentFrames:
         for frames before it.
         """
         if untouched is not self._untouched:
-            self._untouched, self._known = untouched, []
+            self._untouched, self._known = untouched, {}
         newest = len(history) - 1
-        chosen = [self._preprocessed(history[max(newest - back, 0)]) for back in self._offsets]
+        chosen = [history[max(newest - back, 0)] for back in self._offsets]
+        for frame in chosen:
+            if id(frame) not in self._known:
+                touch = torch.from_numpy(self._preprocess(frame[None], untouched))
+                self._known[id(frame)] = frame, touch
         held = {id(frame) for frame in history}
-        self._known = [entry for entry in self._known if id(entry[0]) in held]
-        return torch.stack(chosen, 1)
-
-    def _preprocessed(self, frame: Image) -> Float[Tensor, "1 3 H W"]:
-        for known, touch in self._known:
-            if known is frame:
-                return touch
-        assert self._untouched is not None
-        touch = torch.from_numpy(self._preprocess(frame[None], self._untouched))
-        self._known.append((frame, touch))
-        return touch
+        self._known = {key: known for key, known in self._known.items() if key in held}
+        return torch.stack([self._known[id(frame)][1] for frame in chosen], 1)

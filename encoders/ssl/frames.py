@@ -91,15 +91,10 @@ def sample_recordings(
     seed: int,
     offsets: tuple[int, ...] = (0,),
 ) -> TouchFrames:
-    """Draw images at random from every recording, as `sample_frames` does from episodes.
+    """Draw images at random from recordings of one sensor, at least one; see `sample_frames`.
 
-    UserError: an image is broken, or not of the sensor's shape.
-
-    Args:
-        recordings: Recordings of one sensor, at least one.
-        per_recording: Images drawn from each; all of a shorter one.
-        seed: Random seed; a recording's draw does not depend on later recordings.
-        offsets: As for `sample_frames`.
+    A recording's draw does not depend on later ones. UserError: an image is broken, or not of the
+    sensor's shape.
     """
     sensor = recordings[0].sensor
     preprocess = preprocessor_for(sensor)
@@ -126,12 +121,9 @@ def _draw_rows(
 
 
 def find_sensor_name(sensor: str | None, *sets: EpisodeSet) -> str:
-    """Return the fingertip sensor of all episodes.
+    """Return the fingertip sensor of all episodes; `sensor` is that of those that do not name theirs.
 
     UserError: unknown, not named, or not the same in all episodes.
-
-    Args:
-        sensor: Its name, for episodes that do not name theirs.
     """
     sensor = sensor or str(sets[0].meta(0).get("sensor", ""))
     if not sensor:
