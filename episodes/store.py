@@ -72,11 +72,11 @@ class EpisodeWriter:
 
     def _load(self) -> SetMetadata | None:
         """Return the checked metadata of the set; None before the first episode."""
-        found = None
+        found, wrong = None, []
         if (self._root / set_files.INFO).exists():
-            features = set_files.load_info(self._root)["features"]
+            info = set_files.load_info(self._root)
             table = episode_table.load_table(self._root)
-            if path := foreign_file(self._root, features, table):
+            if path := foreign_file(self._root, info["features"], table):
                 raise refusal(self._root, path)
             found = SetMetadata.load(self._root)
             if found.fps != self._fps:
@@ -84,12 +84,10 @@ class EpisodeWriter:
                     f"{self._root} runs at {found.fps} frames per second, not {self._fps}: "
                     "continue it at its own rate or record into another folder"
                 )
-        doubtful = unlisted_files(self._root, found)
-        if found is not None:
-            info, counted = set_files.load_info(self._root), found.info()
+            counted = found.info()
             if any(info[key] != counted[key] for key in info if key.startswith("total_")):
-                doubtful.append(set_files.INFO)
-        if doubtful:
+                wrong = [set_files.INFO]
+        if doubtful := unlisted_files(self._root, found) + wrong:
             raise UserError(
                 f"{self._root} was interrupted (see {doubtful[0]}): "
                 f"{set_files.repair_command(self._root)}"

@@ -42,19 +42,13 @@ def annotate_all(
     settings: AnnotationSettings,
     out: Path,
 ) -> dict[str, Any]:
-    """Annotate the recordings that `out` does not hold yet.
+    """Annotate the recordings, whose paths are relative to `root`, that `out` does not hold yet.
 
-    Writes one line per recording to `annotations.jsonl`, or with the reason to `left_out.jsonl`.
+    Writes one line per recording to `annotations.jsonl`, or with the reason to `left_out.jsonl`. Returns
+    numbers over all lines: `recordings`, `annotated`, `left_out` by reason, `instances`, and `dropped`
+    boxes by reason.
 
     UserError: a line is broken, or the lines were made by other models or settings.
-
-    Args:
-        root: Folder that their paths are relative to.
-        out: Folder of the run, which exists.
-
-    Returns:
-        Numbers over all lines: `recordings`, `annotated`, `left_out` by reason, `instances`, and `dropped`
-        boxes by reason.
     """
     provenance = {**models.names, **settings.as_json()}
     annotated = records.LinesFile(out / ANNOTATIONS, records.AnnotatedTouch)
