@@ -124,7 +124,7 @@ def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
 def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> None:
     paper = replace(ALIGN_PRESETS["paper"], backbone="vit-tiny", epochs=1, batch_size=8)
     encoder = align(TRAIN, VAL, TogetherTowers(), paper, SENSOR, tmp_path, FRESH, {})
-    assert encoder.config.embedding_dim == 48 and encoder.image_head is None
+    assert encoder.config.embedding_dim == 48 and isinstance(encoder.image_head, torch.nn.Identity)
     metrics = json.loads((tmp_path / "metrics.jsonl").read_text())
     assert metrics["touch_to_image_loss"] >= metrics["touch_to_image_floor"] - 1e-4
     assert "contact_accuracy" not in metrics

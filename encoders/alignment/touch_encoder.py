@@ -87,8 +87,8 @@ class TouchEncoder(BaseTouchEncoder):
         width = EfficientNetBackbone.width if vit is None else vit.width
         self.touch_head = nn.Linear(width, d, bias=False)
         together = config.pretrained_together
-        self.image_head = None if together else nn.Linear(config.image_dim, d, bias=False)
-        self.text_head = None if together else nn.Linear(config.text_dim, d, bias=False)
+        self.image_head = nn.Identity() if together else nn.Linear(config.image_dim, d, bias=False)
+        self.text_head = nn.Identity() if together else nn.Linear(config.text_dim, d, bias=False)
 
     def embed_touch(
         self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
@@ -98,12 +98,8 @@ class TouchEncoder(BaseTouchEncoder):
 
     def project_image(self, embeddings: Float[Tensor, "n k"]) -> Float[Tensor, "n d"]:
         """Map the image tower's embeddings into the shared space."""
-        if self.image_head is not None:
-            embeddings = self.image_head(embeddings)
-        return F.normalize(embeddings, dim=1)
+        return F.normalize(self.image_head(embeddings), dim=1)
 
     def project_text(self, embeddings: Float[Tensor, "n k"]) -> Float[Tensor, "n d"]:
         """Map the text tower's embeddings into the shared space."""
-        if self.text_head is not None:
-            embeddings = self.text_head(embeddings)
-        return F.normalize(embeddings, dim=1)
+        return F.normalize(self.text_head(embeddings), dim=1)

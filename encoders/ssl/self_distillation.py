@@ -19,13 +19,6 @@ def frozen_copy(module: nn.Module) -> Any:
     return copy.deepcopy(module).requires_grad_(False)
 
 
-@torch.no_grad()
-def update_average(average: nn.Module, module: nn.Module, momentum: float) -> None:
-    """Update a moving average: average <- momentum * average + (1 - momentum) * module."""
-    for mean, weight in zip(average.parameters(), module.parameters(), strict=True):
-        mean.lerp_(weight, 1 - momentum)
-
-
 class SelfDistillation(nn.Module):
     """Backbone that learns from its own moving average; subclasses define the objective.
 
@@ -57,10 +50,12 @@ class SelfDistillation(nn.Module):
         """Return the share of the training that is done."""
         return min(self.step.item() / self._steps, 1.0)
 
+    @torch.no_grad()
     def update_teacher(self) -> None:
         """Update the averages; to be called after every update of the weights."""
         first, last = self._momentum
         momentum = first + self.done * (last - first)
         for average, module in self.averaged():
-            update_average(average, module, momentum)
+            for mean, weight in zip(average.parameters(), module.parameters(), strict=True):
+                mean.lerp_(weight, 1 - momentum)
         self.step += 1

@@ -70,13 +70,11 @@ def pressed_surfaces(
     for i in range(surfaces):
         rng = np.random.default_rng([seed, 1, i])
         surface = random_surface(rng)
-        yield (
-            surface,
-            [
-                _filmed(*visible_press(surface, units[rng.integers(_UNITS)], rng), rng)
-                for _ in range(presses)
-            ],
-        )
+        filmed = []
+        for _ in range(presses):
+            unit = units[rng.integers(_UNITS)]
+            filmed.append(_filmed(*visible_press(surface, unit, rng), rng))
+        yield surface, filmed
 
 
 def _pooled(
