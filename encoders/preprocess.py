@@ -1,15 +1,17 @@
 """Preprocessing of raw fingertip frames: the same numbers in training, tests and deployment."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.tactile.light_gain import remove_gain
+from touchgoal.control.tactile.sensor_models import find_model
 from touchgoal.encoders.backbones.sparsh_input import SparshPreprocessor
-from touchgoal.runtime.errors import UserError, unknown_name
+from touchgoal.runtime.errors import UserError
 
+SCALE = 16.0  # grey levels (of 255) that become 1.0; about the contrast of a firm contact
 _ASPECT_TOLERANCE = 0.02  # a GelSight Mini's own 3280 x 2464 differs from 4:3 by 0.2 %
 
 
@@ -24,7 +26,6 @@ class TactilePreprocessor:
     sensor: str  # `SensorModel.name`
     version: int  # version of the numbers
     size: tuple[int, int]  # height and width of the output, px
-    scale: float  # grey levels (of 255) that become 1.0; about the contrast of a firm contact
 
     @property
     def id(self) -> str:
@@ -49,7 +50,7 @@ class TactilePreprocessor:
         interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         untouched = background.astype(np.float32)
         for i, frame in enumerate(frames):
-            change = (remove_gain(frame, untouched) - untouched) / np.float32(self.scale)
+            change = (remove_gain(frame, untouched) - untouched) / np.float32(SCALE)
             out[i] = cv2.resize(change, (w, h), interpolation=interpolation).transpose(2, 0, 1)
         return out
 
@@ -90,17 +91,7 @@ def check_images(name: str, images: object, ndim: tuple[int, ...]) -> None:
 
 Preprocessor = TactilePreprocessor | SparshPreprocessor
 
-_LANDSCAPE = (
-    "gelsight_mini", "gelsight_mini_markers", "gelsight", "gelsight_markers", "gelsight_wedge"
-)  # fmt: skip
-PREPROCESSORS = {
-    sensor: TactilePreprocessor(sensor, version=1, size=size, scale=16.0)
-    for size, sensors in (((120, 160), _LANDSCAPE), ((160, 120), ("digit",)))
-    for sensor in sensors
-}
-
-
-_FACTORS = {1: 1.0, 3: 2.0, 4: 1.6}  # version -> height and width of the output against version 1's
+_SIDES = {1: (120, 160), 3: (240, 320), 4: (192, 256)}  # version -> shorter and longer side, px
 
 
 def preprocessor_for(sensor: str, version: int = 1) -> TactilePreprocessor:
@@ -108,10 +99,9 @@ def preprocessor_for(sensor: str, version: int = 1) -> TactilePreprocessor:
 
     Version 1 gives 120 x 160 px of a sensor of 4:3, version 3 240 x 320, version 4 192 x 256.
     """
-    if sensor not in PREPROCESSORS:
-        raise unknown_name("sensor", sensor, PREPROCESSORS)
-    if version not in _FACTORS:
+    rows, columns = find_model(sensor).image_shape
+    if version not in _SIDES:
         raise UserError(f"this version of touchgoal has no preprocessor {sensor}/v{version}")
-    plain = PREPROCESSORS[sensor]
-    h, w = (round(_FACTORS[version] * side) for side in plain.size)
-    return replace(plain, version=version, size=(h, w))
+    short, long = _SIDES[version]
+    size = (short, long) if rows < columns else (long, short)
+    return TactilePreprocessor(sensor, version, size)

@@ -50,8 +50,7 @@ def save(
 def shipped_encoder_for(sensor: str | None) -> Path:
     """Return the shipped encoder for a sensor, on the offline towers; the default one for None.
 
-    Raises:
-        UserError: None ships.
+    UserError: none ships.
     """
     directory = _WEIGHTS / sensor if sensor else DEFAULT_ENCODER
     if not directory.is_dir():
@@ -67,12 +66,11 @@ def encoder_names() -> list[str]:
 def find_encoder(name_or_path: str | Path, published: bool = True) -> Path:
     """Return the folder of an encoder of ours, or the file of a published one.
 
+    UserError: no such encoder, or a published one where it is not accepted.
+
     Args:
         name_or_path: A folder; a name of `encoder_names`, such as a sensor's; published Sparsh
             weights, as file, folder or Hugging Face id.
-
-    Raises:
-        UserError: No such encoder, or a published one where it is not accepted.
     """
     name = str(name_or_path)
     for directory in (Path(name), _WEIGHTS / name):
@@ -99,13 +97,12 @@ def load_encoder(name_or_path: str | Path, sensor: str | None = None) -> AnyTouc
         encoder = load_encoder("gelsight_mini")
         embeddings = encoder.embed(images)  # uint8 (n, 240, 320, 3); the first one untouched
 
+    UserError: no such encoder, a damaged one, or one made for another sensor or version of the
+    preprocessor.
+
     Args:
         name_or_path: See `find_encoder`; `published.load_published` has the options of published ones.
         sensor: Name of the sensor that the encoder must be for; None for any.
-
-    Raises:
-        UserError: No such encoder, a damaged one, or one made for another sensor or version of the
-            preprocessor.
     """
     path = find_encoder(name_or_path)
     if not path.is_dir():

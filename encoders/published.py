@@ -22,7 +22,7 @@ from touchgoal.encoders.backbones.sparsh import NORM_EPSILON, SQUARE, UPRIGHT
 from touchgoal.encoders.backbones.sparsh_input import SPARSH, SPARSH_PLAIN
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
-from touchgoal.runtime.errors import UserError, install_extra
+from touchgoal.runtime.errors import UserError
 
 _FILES = (".safetensors", ".ckpt")  # the former holds the encoder alone
 _PATTERN = "*_vit*"  # e.g. dino_vitbase.safetensors
@@ -94,10 +94,8 @@ def _only(folder: Path) -> Path:
 
 def _fetch(repository: str) -> Path:
     """Return the folder in Hugging Face's cache with the weights of a repository."""
-    try:
-        from huggingface_hub import snapshot_download
-    except ImportError as error:
-        raise UserError(f"encoders of Hugging Face need: {install_extra('towers')}") from error
+    from huggingface_hub import snapshot_download
+
     folder = Path()
     for suffix in _FILES:
         try:

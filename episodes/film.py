@@ -1,6 +1,5 @@
 """Films of simulated episodes: images, a curve beside them, a caption below."""
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,7 +9,6 @@ from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import BboxBase
-from PIL import Image
 
 from touchgoal.control.features import TRUTH_PROGRESS
 from touchgoal.episodes.media import write_video
@@ -78,9 +76,9 @@ def _draw_panel(
     axes.tick_params(labelsize=7)
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="upper center", ncols=4, fontsize=7, frameon=False, handlelength=1.2)
-    png = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(png)
-    return np.asarray(Image.open(png).convert("RGB")), axes.get_window_extent()
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3], axes.get_window_extent()
 
 
 def _up_to(panel: np.ndarray, box: BboxBase, share: float) -> np.ndarray:

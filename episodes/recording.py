@@ -143,11 +143,10 @@ def record_episode(
     """Record one episode with the expert's actions."""
     observation, info = env.reset(seed=spec.seed, options=spec.options)
     actor, expert = roles(env, spec)
-    if expert is actor:
-        return to_episode(env, list(run(env, actor, observation, info, outcome_seconds=0.0)), spec)
-    ticks = list(run(env, actor, observation, info, expert, outcome_seconds=0.0))
+    teacher = None if expert is actor else expert
+    ticks = list(run(env, actor, observation, info, teacher, outcome_seconds=0.0))
     episode = to_episode(env, ticks, spec)
-    return replace(episode, meta={**episode.meta, "outcome": CORRECTED})
+    return replace(episode, meta={**episode.meta, "outcome": CORRECTED}) if teacher else episode
 
 
 def record_with_film(
@@ -213,11 +212,7 @@ def collect(
     the episodes in progress. The progress bar counts successes and names the commonest failure.
     Returns the `meta` of each episode, outcome and success included. UserError: nothing to record,
     the set cannot be continued, or another process records into it. NoSuccessError: the first
-    `max_failures` episodes failed; they are recorded.
-
-    Args:
-        roles: Actor and expert; must pickle.
-        max_failures: Stop after so many first episodes without a success; None for never.
+    `max_failures` episodes failed; they are recorded. `roles` must pickle.
     """
     if not specs:
         raise UserError("nothing to collect: ask for at least one episode")

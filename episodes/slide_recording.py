@@ -46,13 +46,8 @@ def record_rig(
 ) -> EpisodeSet:
     """Record the first `count` episodes of a rig; those that the folder holds are not simulated again.
 
-    Args:
-        simulate: makes a recording from its number, in another process.
-        rig: description of the rig and its seed.
-        workers: see `parallel_map`.
-        shard: part of the episodes to record; the others go to other folders.
-
-    UserError: the folder holds recordings of another rig, or cannot be written to.
+    `simulate` makes a recording from its number, in another process; `rig` describes the rig and its
+    seed. UserError: the folder holds recordings of another rig, or cannot be written to.
     """
     with closing(EpisodeWriter(root, fps=FPS)) as writer:
         meta = EpisodeSet(root).meta(0) if len(writer) else {}

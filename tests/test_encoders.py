@@ -18,12 +18,12 @@ from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.infonce import info_nce, symmetric_info_nce
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS
-from touchgoal.encoders.preprocess import PREPROCESSORS, check_images
+from touchgoal.encoders.preprocess import SCALE, check_images, preprocessor_for
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import portable
 
 ROOT = Path(__file__).parents[1]
-MINI = PREPROCESSORS["gelsight_mini"]
+MINI = preprocessor_for("gelsight_mini")
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +45,7 @@ def test_untouched_is_zero_and_change_is_in_units_of_the_scale() -> None:
     assert out.shape == (2, 3, 120, 160)
     np.testing.assert_array_equal(out[0], 0)
     expected = np.zeros((3, 120, 160))
-    expected[1, :40] = 16 / MINI.scale
+    expected[1, :40] = 16 / SCALE
     np.testing.assert_allclose(out[1], expected, atol=1e-6)
 
 
@@ -56,7 +56,7 @@ def test_pixels_are_averaged_over_their_area() -> None:
     out = MINI(frame, background)
     steady = remove_gain(frame[0], background)
     blocks = steady.reshape(120, 2, 160, 2, 3).mean((1, 3)).transpose(2, 0, 1)
-    np.testing.assert_allclose(out[0] * MINI.scale + 100, blocks, atol=1e-3)
+    np.testing.assert_allclose(out[0] * SCALE + 100, blocks, atol=1e-3)
 
 
 def unit(n: int, d: int) -> torch.Tensor:

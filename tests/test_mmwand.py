@@ -15,7 +15,7 @@ from benchmarks.papers.mmwand.splits import SPLITS, split_touches
 from benchmarks.published_touch.objectfolder_real import read_objectfolder_real, read_touches
 from benchmarks.published_touch.tvl import read_tvl
 from touchgoal.control import features as ft
-from touchgoal.encoders.alignment.words import surface_ranks
+from touchgoal.encoders.alignment.described_touches import surface_ranks
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers

@@ -13,7 +13,6 @@ from toy_touches import SENSOR, moving_blobs
 
 from touchgoal.control import features as ft
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.sparsh import Method, backbone_for
 from touchgoal.encoders.ssl import train
 from touchgoal.encoders.ssl.config import DinoConfig, IJepaConfig, MaeConfig, VJepaConfig
@@ -37,8 +36,7 @@ def rng(seed: int = 0) -> torch.Generator:
 
 def blobs(count: int, seed: int) -> TouchFrames:
     """Round contacts in single frames."""
-    moving = moving_blobs(count, seed, frames=1)
-    return replace(moving, touch=moving.touch[:, 0], stride=1)
+    return replace(moving_blobs(count, seed, frames=1), stride=1)
 
 
 def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> None:
@@ -66,7 +64,7 @@ def test_the_loss_of_views_is_that_of_the_paper() -> None:
     model = toy_dino(replace(DINO, batch_norm=False)).train()
     touch, drawn = moving_blobs(4).touch, model.draw(4, rng())
     model.center.normal_(generator=rng(1))
-    center, images = model.center.clone(), stack_frames(touch.float(), model.backbone.config.vit)
+    center, images = model.center.clone(), model.backbone.stack(touch.float())
     views = [*drawn["global_ids"].unbind(1), *drawn["local_ids"].unbind(1)]
     assert len(views) == 2 + 3
     losses, scores = [], []
@@ -126,7 +124,7 @@ class Flattening(SelfDistillation):
         with torch.no_grad():
             self.backbone.vit.norm.weight.zero_()
             self.backbone.vit.norm.bias.fill_(0.5)
-        return {"loss": (self.backbone.vit(self.stacked(touch)) - 1).square().mean()}
+        return {"loss": (self.backbone.vit(self.backbone.stack(touch.float())) - 1).square().mean()}
 
 
 def test_a_collapsed_training_saves_nothing(
@@ -151,7 +149,7 @@ def test_moments_hold_the_true_past(tmp_path: Path) -> None:
     ticks = moments.touch[:6, :, 0, 60, 80].round().tolist()  # a grey level of 16 is 1.0
     assert ticks == [[t, max(t - 2, 0), max(t - 4, 0)] for t in range(6)]
     single = sample_frames(EpisodeSet(tmp_path), SENSOR, 6, 0)
-    assert torch.equal(single.touch, moments.touch[:, 0]) and single.stride == 1
+    assert torch.equal(single.touch, moments.touch[:, :1]) and single.stride == 1
 
 
 SMALL: dict[str, Any] = {"epochs": 3, "batch_size": 12, "momentum": 0.9}
@@ -198,13 +196,13 @@ def test_what_is_hidden_reaches_the_targets_alone(method: Method) -> None:
     assert all(p.grad is not None for p in model.backbone.parameters())
     context_ids, wanted = (x[0] if isinstance(x, list) else x for x in drawn.values())
     with torch.no_grad():
-        patches = model.backbone.vit.embed_patches(model.stacked(touch))
+        patches = model.backbone.vit.embed_patches(model.backbone.stack(touch.float()))
         before = model.predict(patches, context_ids, wanted)
         for b in range(2):
             for patch in set(range(12)) - set((context_ids[b] % 12).tolist()):
                 y, x = 40 * (patch // 4), 40 * (patch % 4)
                 touch[b, ..., y : y + 40, x : x + 40] += 3
-        images = model.stacked(touch)
+        images = model.backbone.stack(touch.float())
         assert not torch.allclose(model.targets(images)[0, wanted[0, 0]], before[0, 0])
         after = model.predict(model.backbone.vit.embed_patches(images), context_ids, wanted)
     torch.testing.assert_close(after, before)

@@ -50,13 +50,13 @@ def write_videos(folder: Path, splits: tuple[str, ...] = SPLITS, brightness: int
 
 def pressed_up(touch: torch.Tensor) -> np.ndarray:
     """Which touches are brighter than the untouched sensor and which darker: +1, 0, -1."""
-    mean = touch.float().mean(dim=(1, 2, 3)).numpy()
+    mean = touch.float().flatten(1).mean(1).numpy()
     return np.where(np.abs(mean) < 0.005, 0, np.sign(mean))
 
 
 def test_held_out_videos_are_judged_by_and_not_learned_from(tmp_path: Path) -> None:
     touch = open_touch([write_videos(tmp_path / "videos")], (), None)
-    train, judged = (draw(9, 0, None) for draw in (touch.train, touch.validation))
+    train, judged = (draw(9, 0, (0,)) for draw in (touch.train, touch.validation))
     assert train.sensor == "gelsight_mini" and len(train) == len(judged) == 18
     assert set(pressed_up(train.touch)) == {0, 1} and set(pressed_up(judged.touch)) == {0, -1}
     moments = touch.train(9, 0, (0, 2))
@@ -68,10 +68,10 @@ def test_several_folders_are_learned_from_together(tmp_path: Path) -> None:
     for i in (1, 2, 3):  # ObjectFolder's layout: the last is held out
         write(tmp_path / "pickles" / f"{i:03d}.pkl", [encoded(gel(i, (240, 320)))])
     touch = open_touch([videos, tmp_path / "pickles"], (), "gelsight_mini")
-    assert len(touch.train(9, 0, None)) == 18 + 2
-    assert len(touch.validation(9, 0, None)) == 18 + 1
+    assert len(touch.train(9, 0, (0,))) == 18 + 2
+    assert len(touch.validation(9, 0, (0,))) == 18 + 1
     elsewhere = write_videos(tmp_path / "others", ("train", "unlabelled"), brightness=150)
-    assert len(open_touch([videos], [elsewhere], None).validation(9, 0, None)) == 18 + 18
+    assert len(open_touch([videos], [elsewhere], None).validation(9, 0, (0,))) == 18 + 18
 
 
 def test_shared_frames_are_refused_whatever_the_folder_and_the_order(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from touchgoal.encoders.annotation.boxes import Box, Detection, Image
+from touchgoal.control.arrays import Image
+from touchgoal.encoders.annotation.boxes import Box, Detection
 from touchgoal.runtime.image_file import read_image
 
 COLOURS = {"red ball": (210, 40, 40), "green cup": (40, 190, 60), "blue box": (50, 70, 220)}

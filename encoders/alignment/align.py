@@ -195,7 +195,8 @@ def batch_losses(
     """Return the weighted sum "loss" (the paper's Eq. 2) and its terms.
 
     Touches without contact have no image and take part in touch-text only. A batch with fewer than
-    two touches in contact has no image terms.
+    two touches in contact has no image terms. Image-text trains the heads of towers that were not
+    pretrained together (offline); a CLIP skips it.
     """
     nce = symmetric_info_nce if config.symmetric else info_nce
     c, tau = batch.contact, config.temperature
@@ -208,7 +209,7 @@ def batch_losses(
         loss = loss + terms["loss_touch_image"]
         if not pretrained_together:
             terms["loss_image_text"] = nce(batch.image[c], batch.text[c], tau, same_c)
-            loss = loss + config.image_text_weight * terms["loss_image_text"]
+            loss = loss + terms["loss_image_text"]
     else:
         loss = loss + 0 * batch.image.sum()  # with several processes every head needs a gradient
     return {"loss": loss} | terms

@@ -41,9 +41,6 @@ class AlignConfig:
     final_lr: Annotated[float, FIXED] = 0.01  # share of `lr`, reached by a cosine; 1: constant
     temperature: Annotated[float, FIXED] = 0.1  # of the InfoNCE losses; not learned
     text_weight: Annotated[float, FIXED] = 1.0  # of the touch-text loss: the MMWand paper's lambda
-    # Weight of the image-text loss, which trains the heads of towers that were not pretrained
-    # together (offline); a CLIP skips it.
-    image_text_weight: Annotated[float, FIXED] = 1.0
     symmetric: Annotated[bool, FIXED] = True  # else only touches choose among images and texts
     # Every touch, image and text of the same object is a positive, not the partner alone.
     multi_positive: Annotated[bool, FIXED] = True
@@ -81,11 +78,9 @@ ALIGN_PRESETS: dict[str, AlignConfig] = {
         batch_size=64,
         optimizer="adam",
         lr=1e-4,
-        weight_decay=0.05,
         warmup=0.0,
         final_lr=1.0,
         temperature=0.2,
-        text_weight=1.0,
         symmetric=False,
         multi_positive=False,
         no_contact_texts=(),

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from touchgoal.control.arrays import Image
 from touchgoal.control.sensors.clip import open_clip
 from touchgoal.runtime.errors import UserError
 
-Image = UInt8[np.ndarray, "h w 3"]
 Alpha = Float32[np.ndarray, "h w"]
 
 _NEAR, _FAR = 0.035, 0.09  # distance from the screen's chromaticity: surely screen, surely not

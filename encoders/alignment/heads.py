@@ -33,10 +33,10 @@ class PairedEmbeddings:
 class Heads(nn.Module):
     """Maps from image and sentence embeddings to touch; all give unit vectors."""
 
-    def __init__(self, touch_dim: int, image_dim: int, text_dim: int, text_hidden: int) -> None:
+    def __init__(self, touch_dim: int, image_dim: int, text_dim: int) -> None:
         super().__init__()
         self.image = TowerMap(image_dim, touch_dim)
-        self.text = TowerMap(text_dim, touch_dim, text_hidden)
+        self.text = TowerMap(text_dim, touch_dim, _TEXT_HIDDEN)
 
 
 def fit_heads(data: PairedEmbeddings, config: HeadsConfig, seed: int) -> Heads:
@@ -45,10 +45,9 @@ def fit_heads(data: PairedEmbeddings, config: HeadsConfig, seed: int) -> Heads:
     Touches, views and sentences of the same object all count as positives.
     """
     draw = torch.Generator().manual_seed(seed)
-    dims = data.touch.shape[1], data.image.shape[2], data.texts.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        heads = Heads(*dims, _TEXT_HIDDEN)
+        heads = Heads(data.touch.shape[1], data.image.shape[2], data.texts.shape[1])
     heads.image.centre(data.image)
     heads.text.centre(data.texts)
     optimizer = torch.optim.AdamW(heads.parameters(), _LR, weight_decay=_WEIGHT_DECAY)

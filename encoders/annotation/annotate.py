@@ -6,18 +6,17 @@ reference frame is the first camera frame before it that shows the object unobst
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from touchgoal.control.arrays import Image
 from touchgoal.encoders.annotation import records
 from touchgoal.encoders.annotation.boxes import (
     Box,
     Detection,
-    Image,
     crop,
     intersection,
     iou,
@@ -33,7 +32,6 @@ from touchgoal.runtime.progress import track
 ANNOTATIONS, LEFT_OUT = "annotations.jsonl", "left_out.jsonl"
 _SENSOR_SOUGHT = 5  # first frames in which the sensor is looked for: the reference may not show it
 
-_MIN_DEFORMATION = 1.5  # least that counts as contact, times the untouched frames' noise
 _CAPTION_PROMPT = "What specific object is presented in the scene?"  # MMWand, appendix A
 
 
@@ -44,19 +42,13 @@ def annotate_all(
     settings: AnnotationSettings,
     out: Path,
 ) -> dict[str, Any]:
-    """Annotate the recordings that `out` does not hold yet.
+    """Annotate the recordings, whose paths are relative to `root`, that `out` does not hold yet.
 
-    Writes one line per recording to `annotations.jsonl`, or with the reason to `left_out.jsonl`.
+    Writes one line per recording to `annotations.jsonl`, or with the reason to `left_out.jsonl`. Returns
+    numbers over all lines: `recordings`, `annotated`, `left_out` by reason, `instances`, and `dropped`
+    boxes by reason.
 
     UserError: a line is broken, or the lines were made by other models or settings.
-
-    Args:
-        root: Folder that their paths are relative to.
-        out: Folder of the run, which exists.
-
-    Returns:
-        Numbers over all lines: `recordings`, `annotated`, `left_out` by reason, `instances`, and `dropped`
-        boxes by reason.
     """
     provenance = {**models.names, **settings.as_json()}
     annotated = records.LinesFile(out / ANNOTATIONS, records.AnnotatedTouch)
@@ -86,8 +78,8 @@ def annotate(
     """
     touches = (_read(root / touch) for _, touch in recording.steps)
     reference_touch = root / recording.reference[1]
-    contact = match_contact(touches, _read(reference_touch), _MIN_DEFORMATION)
-    contact_image, touch = recording.steps[contact.index]
+    index, deformation, threshold = match_contact(touches, _read(reference_touch))
+    contact_image, touch = recording.steps[index]
     video = _video_until(recording, contact_image)
     sensor = _track_sensor([root / name for name in video], models, settings)
     chosen = match_reference(sensor)
@@ -114,7 +106,7 @@ def annotate(
         object=instances[touched].caption,
         dropped=dropped,
         contact=records.Contact(
-            _absolute(root / contact_image), at_contact, contact.deformation, contact.threshold
+            _absolute(root / contact_image), at_contact, deformation, threshold
         ),
         provenance=provenance,
     )
@@ -132,18 +124,14 @@ def _track_sensor(
 ) -> list[Box | None]:
     """Return the sensor's box in each camera image; None before the first in which it is seen."""
     for first, path in enumerate(paths[:_SENSOR_SOUGHT]):
-        box = settings.sensor_box or _find_sensor(_read(path), models, settings)
+        box = settings.sensor_box
+        if box is None:
+            found = models.detect(_read(path), "robot gripper")
+            sure = [d for d in found if d.score >= settings.min_score]
+            box = max(sure, key=lambda d: d.score).box if sure else None
         if box is not None:
             return [None] * first + track_csrt(map(_read, paths[first:]), box)
     raise records.LeftOut("low confidence: the sensor was not detected")
-
-
-def _find_sensor(
-    image: Image, models: AnnotationModels, settings: AnnotationSettings
-) -> Box | None:
-    found = models.detect(image, "robot gripper")
-    best = max(found, key=lambda d: d.score, default=None)
-    return best.box if best is not None and best.score >= settings.min_score else None
 
 
 def _read(path: Path) -> Image:
@@ -190,42 +178,28 @@ def _summary(
 
 
 _UNTOUCHED = 5  # frames of a recording closest to the reference, taken as untouched
+_MIN_DEFORMATION = 1.5  # least that counts as contact, times the untouched frames' noise
 
 
-@dataclass(frozen=True)
-class ContactFrame:
-    """Frame of the largest deformation."""
+def match_contact(touches: Iterable[Image], reference: Image) -> tuple[int, float, float]:
+    """Return the index of the contact frame, its norm, and the least norm of a contact, in counts.
 
-    index: int  # index of the frame
-    deformation: float  # norm of its difference to the reference frame, counts
-    threshold: float  # smallest norm that counts as contact, counts
-
-
-def match_contact(
-    touches: Iterable[Image], reference: Image, min_deformation: float
-) -> ContactFrame:
-    """Return the contact frame of a recording.
-
-    Noise alone puts every untouched frame at nearly the same distance from the reference. The threshold
-    is `min_deformation` times the median distance of the 5 frames closest to the reference.
+    Norms are those of the difference to the reference, a frame without contact. Noise alone puts every
+    untouched frame at nearly the same distance from it: the threshold is 1.5 times the median distance
+    of the 5 frames closest to it.
 
     LeftOut: too few frames are active, or none is deformed enough.
-
-    Args:
-        touches: Tactile frames in time.
-        reference: Tactile frame without contact.
-        min_deformation: Factor of the untouched frames' distance, above 1.
     """
     distances = deformations(touches, reference)
     active = np.flatnonzero(np.isfinite(distances))
     if len(active) <= _UNTOUCHED:
         raise records.LeftOut("fewer than 6 active tactile frames")
     untouched = np.sort(distances[active])[:_UNTOUCHED]
-    threshold = min_deformation * float(np.median(untouched))
+    threshold = _MIN_DEFORMATION * float(np.median(untouched))
     index = int(active[distances[active].argmax()])
     if distances[index] <= threshold:
         raise records.LeftOut("not enough deformation: the sensor touches nothing")
-    return ContactFrame(index, float(distances[index]), threshold)
+    return index, float(distances[index]), threshold
 
 
 def deformations(touches: Iterable[Image], reference: Image) -> Float[np.ndarray, " n"]:
@@ -250,11 +224,8 @@ def deformations(touches: Iterable[Image], reference: Image) -> Float[np.ndarray
 def match_reference(sensor: Sequence[Box | None]) -> int:
     """Return the first frame in which the sensor does not cover the place that it will touch.
 
-    LeftOut: the sensor is lost at the contact, or covers the place in every frame.
-
-    Args:
-        sensor: The sensor's box in each camera frame up to the contact frame, the last; None where it is
-            not in view.
+    `sensor` is its box in each camera frame up to the contact frame, the last; None where it is not in
+    view. LeftOut: the sensor is lost at the contact, or covers the place in every frame.
     """
     contact = sensor[-1]
     if contact is None:
@@ -274,12 +245,7 @@ def select_instances(
 ) -> tuple[list[Detection], dict[str, int]]:
     """Return the objects among the detections, best first, and how many were dropped for what reason.
 
-    LeftOut: no object remains.
-
-    Args:
-        detections: Boxes in the reference frame.
-        sensor: The sensor's box in the reference frame; None if it is not in view.
-        min_score: Smallest confidence.
+    Boxes are in the reference frame; `sensor` is None if it is not in view. LeftOut: no object remains.
     """
     kept: list[Detection] = []
     dropped: Counter[str] = Counter()

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from touchgoal.control.arrays import Image
+
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom, px; right and bottom are excluded."""
-
-Image = UInt8[np.ndarray, "h w 3"]  # RGB
 
 _GREY = (128, 128, 128)
 
@@ -65,9 +65,8 @@ def square_crop(image: Image, box: Box, size: int) -> UInt8[np.ndarray, "size si
     smaller = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     resized = cv2.resize(pixels, (width, height), interpolation=smaller)
     top, left = (size - height) // 2, (size - width) // 2
-    square = np.full((size, size, 3), _GREY, np.uint8)
-    square[top : top + height, left : left + width] = resized
-    return square
+    sides = top, size - height - top, left, size - width - left
+    return cv2.copyMakeBorder(resized, *sides, cv2.BORDER_CONSTANT, value=_GREY)
 
 
 TRACKER = f"CSRT of OpenCV {cv2.__version__}"

@@ -4,7 +4,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from touchgoal.encoders.annotation.boxes import TRACKER, Detection, Image, area, clipped
+from touchgoal.control.arrays import Image
+from touchgoal.encoders.annotation.boxes import TRACKER, Detection, area, clipped
 from touchgoal.encoders.towers.transformers_models import load_model, load_part
 
 _LOWEST_SCORE = 0.05  # boxes below are background; the others are counted as low confidence

@@ -134,11 +134,7 @@ def annotated_touches(records: Sequence[AnnotatedTouch], sensor: str) -> Touches
     instances with that object. The view is the crop of the touched instance in a grey square of 224 px.
     Tactile images are turned and resized to the sensor's format.
 
-    UserError: an unknown sensor, or an image is missing or broken.
-
-    Args:
-        records: As `read_annotations` returns them.
-        sensor: Name of the fingertip sensor; VisGel's is gelsight_markers.
+    UserError: an unknown sensor (VisGel's is gelsight_markers), or an image is missing or broken.
     """
     find_model(sensor)
     frames, backgrounds, views, objects = [], [], [], []

@@ -4,13 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from touchgoal.control.arrays import Image
 from touchgoal.encoders.backbones.vit import ViTConfig
 from touchgoal.encoders.preprocess import Preprocessor
-
-Frame = UInt8[np.ndarray, "h w 3"]
 
 
 def frame_offsets(vit: ViTConfig, stride: int) -> tuple[int, ...]:
@@ -29,40 +28,29 @@ def past_rows(
     return np.maximum(rows[:, None] - np.array(offsets), np.reshape(first, (-1, 1)))
 
 
-def stack_frames(
-    frames: Float[Tensor, "n t 3 h w"], vit: ViTConfig
-) -> Float[Tensor, "n c *clip h w"]:
-    """Stack frames, newest first, as channels of one image, or as a clip for tubelets."""
-    return frames.flatten(1, 2) if vit.tubelet == 1 else frames.transpose(1, 2)
-
-
 class RecentFrames:
     """Cache of the last preprocessed frames of one sensor, so that a tick preprocesses only one."""
 
     def __init__(self, preprocess: Preprocessor, offsets: tuple[int, ...]) -> None:
         self._preprocess, self._offsets = preprocess, offsets
-        self._untouched: Frame | None = None
-        self._known: list[tuple[Frame, Float[Tensor, "1 3 H W"]]] = []
+        self._untouched: Image | None = None
+        # by the id of a frame, which is kept so that its id stays its own
+        self._known: dict[int, tuple[Image, Float[Tensor, "1 3 H W"]]] = {}
 
-    def latest(self, history: Sequence[Frame], untouched: Frame) -> Float[Tensor, "1 t 3 H W"]:
+    def latest(self, history: Sequence[Image], untouched: Image) -> Float[Tensor, "1 t 3 H W"]:
         """Return the newest frame and those at the offsets before it, for an encoder's `stack`.
 
         The history holds the same objects from tick to tick, the oldest first, which also stands
         for frames before it.
         """
         if untouched is not self._untouched:
-            self._untouched, self._known = untouched, []
+            self._untouched, self._known = untouched, {}
         newest = len(history) - 1
-        chosen = [self._preprocessed(history[max(newest - back, 0)]) for back in self._offsets]
+        chosen = [history[max(newest - back, 0)] for back in self._offsets]
+        for frame in chosen:
+            if id(frame) not in self._known:
+                touch = torch.from_numpy(self._preprocess(frame[None], untouched))
+                self._known[id(frame)] = frame, touch
         held = {id(frame) for frame in history}
-        self._known = [entry for entry in self._known if id(entry[0]) in held]
-        return torch.stack(chosen, 1)
-
-    def _preprocessed(self, frame: Frame) -> Float[Tensor, "1 3 H W"]:
-        for known, touch in self._known:
-            if known is frame:
-                return touch
-        assert self._untouched is not None
-        touch = torch.from_numpy(self._preprocess(frame[None], self._untouched))
-        self._known.append((frame, touch))
-        return touch
+        self._known = {key: known for key, known in self._known.items() if key in held}
+        return torch.stack([self._known[id(frame)][1] for frame in chosen], 1)

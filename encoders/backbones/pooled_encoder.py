@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.backbones.tower_map import TowerMap
 from touchgoal.encoders.compiled_network import CompiledNetwork
-from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.preprocess import SCALE, preprocessor_for
 from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import Towers, imagenet_normalised
 from touchgoal.encoders.whitening.text_head import RANK_WORDS, rank_sentences
@@ -84,7 +84,7 @@ class PooledEncoder(BaseTouchEncoder):
         """Build it without whitening; `network`: None for ImageNet's weights."""
         preprocess = preprocessor_for(config.sensor, config.preprocessor_version)
         super().__init__(preprocess, config.features)
-        self.config, self._scale = config, preprocess.scale
+        self.config = config
         self.register_buffer("mean", torch.zeros(config.features))
         self.register_buffer("whitening", torch.eye(config.features))
         if config.towers is not None:
@@ -150,14 +150,14 @@ class PooledEncoder(BaseTouchEncoder):
         return (pooled - self.mean) @ self.whitening
 
     def _length(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
-        square = (self._scale * F.avg_pool2d(touch, 2)).square().sum(1)
+        square = (SCALE * F.avg_pool2d(touch, 2)).square().sum(1)
         strength = F.adaptive_avg_pool2d(square, _CELLS).amax((1, 2)).sqrt()
         return strength**4 / (strength**4 + _HALF_LENGTH**4)
 
     @torch.no_grad()
     def pool(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
         """Return means and standard deviations over the image, stage by stage."""
-        images = as_images(touch, self._scale)
+        images = as_images(touch)
         if touch.device.type == "cpu":
             return self._compiled(images)[0]
         return self._stages[0].to(touch.device)(images)
@@ -181,10 +181,6 @@ class PooledStages(nn.Module):
         return torch.cat(pooled, 1)
 
 
-def as_images(touch: Float[Tensor, "n 3 h w"], scale: float) -> Float[Tensor, "n 3 h w"]:
-    """Return preprocessed frames as RGB images, 0 to 1: the change about grey, in more contrast.
-
-    Args:
-        scale: counts of change that are 1.0 in them.
-    """
-    return (128 + _CONTRAST * scale * touch).clamp(0, 255) / 255
+def as_images(touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+    """Return preprocessed frames as RGB images, 0 to 1: the change about grey, in more contrast."""
+    return (128 + _CONTRAST * SCALE * touch).clamp(0, 255) / 255

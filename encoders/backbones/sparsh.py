@@ -8,7 +8,6 @@ from typing import Literal
 
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import ViTConfig
-from touchgoal.encoders.preprocess import preprocessor_for
 
 Method = Literal["mae", "dino", "ijepa", "vjepa"]
 
@@ -33,25 +32,19 @@ _SIZES = {  # Our presets; widths are multiples of 6 (sine and cosine of three a
 }
 
 
-def vit_for(method: Method, size: str, image_size: tuple[int, int]) -> ViTConfig:
-    """Return the network of a method: Sparsh's own, or a smaller one with its input and registers.
-
-    Sizes are tiny, compact, small and base, which is Sparsh's; the image's are px.
-    """
-    published = replace(SPARSH_BASE[method], image_size=image_size)
-    if size == "base":
-        return published
-    return replace(
-        _SIZES[size],
-        image_size=image_size,
-        channels=published.channels,
-        registers=published.registers,
-        tubelet=published.tubelet,
-        frames=published.frames,
-    )
-
-
 def backbone_for(method: Method, size: str, sensor: str, stride: int) -> TouchBackbone:
-    """Return a randomly initialised backbone for a sensor, with frames `stride` ticks apart."""
-    vit = vit_for(method, size, preprocessor_for(sensor).size)
+    """Return a randomly initialised backbone for a sensor, with frames `stride` ticks apart.
+
+    Sizes are base, which is Sparsh's network of the method, and tiny, compact and small, with its input
+    and registers.
+    """
+    vit = SPARSH_BASE[method]
+    if size != "base":
+        vit = replace(
+            _SIZES[size],
+            channels=vit.channels,
+            registers=vit.registers,
+            tubelet=vit.tubelet,
+            frames=vit.frames,
+        )
     return TouchBackbone(TouchBackboneConfig.for_sensor(vit, sensor, stride))

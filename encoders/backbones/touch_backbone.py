@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor, nn
 
-from touchgoal.encoders.backbones.frame_history import frame_offsets, past_rows, stack_frames
+from touchgoal.encoders.backbones.frame_history import frame_offsets, past_rows
 from touchgoal.encoders.backbones.sparsh_input import SparshPreprocessor
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.preprocess import Preprocessor, check_images, preprocessor_for
@@ -37,12 +37,6 @@ class TouchBackboneConfig:
     def embedding_dim(self) -> int:
         """Return the width of an embedding."""
         return self.vit.width
-
-    def find_preprocessor(self) -> Preprocessor:
-        """Return the sensor's current preprocessor; UserError for an unknown sensor."""
-        if self.sensor is None:
-            return SparshPreprocessor.of(self.preprocessor, self.vit.image_size)
-        return preprocessor_for(self.sensor)
 
 
 class BaseTouchEncoder(nn.Module):
@@ -168,8 +162,12 @@ class TouchBackbone(BaseTouchEncoder):
 
     def __init__(self, config: TouchBackboneConfig, vit: ViT | None = None) -> None:
         """Wrap a ViT, or a randomly initialised one; UserError for an unknown sensor."""
+        if config.sensor is None:
+            preprocess = SparshPreprocessor.of(config.preprocessor, config.vit.image_size)
+        else:
+            preprocess = preprocessor_for(config.sensor)
         offsets = frame_offsets(config.vit, config.stride)
-        super().__init__(config.find_preprocessor(), config.embedding_dim, offsets)
+        super().__init__(preprocess, config.embedding_dim, offsets)
         self.config = config
         self.vit = ViT(config.vit) if vit is None else vit
 
@@ -180,5 +178,5 @@ class TouchBackbone(BaseTouchEncoder):
         return self.vit.features(touch, ids_keep)
 
     def stack(self, frames: Float[Tensor, "n t 3 h w"]) -> Float[Tensor, "n c *t h w"]:
-        """See BaseTouchEncoder."""
-        return stack_frames(frames, self.config.vit)
+        """Return frames as channels of one image, or as a clip for tubelets."""
+        return frames.flatten(1, 2) if self.config.vit.tubelet == 1 else frames.transpose(1, 2)

@@ -34,7 +34,7 @@ class ViTConfig:
     norm_epsilon: float = 1e-5  # epsilon of every LayerNorm
 
     def __post_init__(self) -> None:
-        if self.width % (4 * self.heads) or self.width % self.heads:
+        if self.width % (4 * self.heads):
             raise UserError(
                 f"ViT width {self.width} must be divisible by 4 x heads ({self.heads}): "
                 "choose another width or number of heads"

@@ -48,13 +48,10 @@ def find_model(folder: Path) -> tuple[Path, Kind]:
 def push(folder: Path, repository: str, private: bool, api: "HfApi") -> str:
     """Upload an encoder or a policy in one commit and return the commit's address.
 
-    The repository is made if needed; files of an earlier push that are gone here are deleted there.
+    The repository is made if needed, public or private; files of an earlier push that are gone here are deleted there.
     A card that lies in the folder is used in place of a new one.
 
     UserError: no such folder, no token, no network, or the Hub refuses.
-
-    Args:
-        private: Make a new repository private.
     """
     from huggingface_hub import CommitOperationAdd, CommitOperationDelete, get_token
 

@@ -89,7 +89,7 @@ class Dino(SelfDistillation):
         self, touch: Tensor, global_ids: Int[Tensor, "b 2 k"], local_ids: Int[Tensor, "b v j"]
     ) -> dict[str, Float[Tensor, ""]]:
         """Return the loss, and the mutual information of touch and prototype, nats: 0 at collapse."""
-        images = self.stacked(touch)
+        images = self.backbone.stack(touch.float())
         with torch.no_grad():
             scores = self._scores(self.teacher, self.teacher_head, images, [global_ids])
             targets = self._targets(scores)

@@ -26,26 +26,12 @@ Recording = ClipRecording | LabelledVideo
 class TouchFrames:
     """n touches."""
 
-    # preprocessed frames in half precision, to save memory. For objectives on several frames, the t
-    # frames of a sample, newest first
-    touch: Float16[Tensor, "n *t 3 h w"]
+    # preprocessed frames in half precision, to save memory; the t frames of a sample, newest first
+    touch: Float16[Tensor, "n t 3 h w"]
     # simulated wrench on each pad (N, Nm, pad frame), for probes only; None if not recorded
     wrench: Float[Tensor, "n 6"] | None
     sensor: str  # name of the fingertip sensor
     stride: int = 1  # ticks between the frames of a sample
-
-    @classmethod
-    def from_samples(
-        cls,
-        samples: list[Float16[Tensor, "_ t 3 h w"]],
-        wrench: Float[Tensor, "n 6"] | None,
-        sensor: str,
-        offsets: tuple[int, ...] | None,
-    ) -> "TouchFrames":
-        """Join the frames of samples, newest first; see `sample_frames` for `offsets`."""
-        touch = torch.cat(samples)
-        stride = offsets[1] if offsets and len(offsets) > 1 else 1
-        return cls(touch if offsets else touch[:, 0], wrench, sensor, stride)
 
     @classmethod
     def joined(cls, parts: list["TouchFrames"]) -> "TouchFrames":
@@ -64,7 +50,7 @@ def sample_frames(
     sensor: str,
     per_episode: int,
     seed: int,
-    offsets: tuple[int, ...] | None = None,
+    offsets: tuple[int, ...] = (0,),
 ) -> TouchFrames:
     """Draw ticks at random from every episode, with every fingertip of each.
 
@@ -75,8 +61,7 @@ def sample_frames(
     Args:
         per_episode: Ticks drawn from each episode; all of a shorter one.
         seed: Random seed; an episode's draw does not depend on the other episodes.
-        offsets: Ticks from the drawn frame back to each frame of a sample, 0 first; None for single
-            frames.
+        offsets: Ticks from the drawn frame back to each frame of a sample, 0 first.
     """
     sides = {side: key for side, key in enumerate(TACTILE) if key in episodes.features}
     if not sides:
@@ -91,29 +76,25 @@ def sample_frames(
         ticks, rows, where = _draw_rows(episodes.lengths[i], per_episode, [seed, i], offsets)
         frames = episodes.read(i, keys, rows).frames
         first = episodes.read(i, keys, [0]).frames
-        known = episodes.read(i, truth, ticks.tolist()).frames
+        forces = episodes.read(i, truth, ticks.tolist()).frames
         for side, key in sides.items():
             touch.append(torch.from_numpy(preprocess(frames[key], first[key][0])).half()[where])
             for name in truth:
-                wrench.append(torch.from_numpy(known[name][:, 6 * side : 6 * side + 6]))
-    return TouchFrames.from_samples(touch, torch.cat(wrench) if truth else None, sensor, offsets)
+                wrench.append(torch.from_numpy(forces[name][:, 6 * side : 6 * side + 6]))
+    known = torch.cat(wrench) if truth else None
+    return TouchFrames(torch.cat(touch), known, sensor, _stride(offsets))
 
 
 def sample_recordings(
     recordings: Sequence[Recording],
     per_recording: int,
     seed: int,
-    offsets: tuple[int, ...] | None = None,
+    offsets: tuple[int, ...] = (0,),
 ) -> TouchFrames:
-    """Draw images at random from every recording, as `sample_frames` does from episodes.
+    """Draw images at random from recordings of one sensor, at least one; see `sample_frames`.
 
-    UserError: an image is broken, or not of the sensor's shape.
-
-    Args:
-        recordings: Recordings of one sensor, at least one.
-        per_recording: Images drawn from each; all of a shorter one.
-        seed: Random seed; a recording's draw does not depend on later recordings.
-        offsets: As for `sample_frames`.
+    A recording's draw does not depend on later ones. UserError: an image is broken, or not of the
+    sensor's shape.
     """
     sensor = recordings[0].sensor
     preprocess = preprocessor_for(sensor)
@@ -123,25 +104,26 @@ def sample_recordings(
         _, rows, where = _draw_rows(len(clip), per_recording, [seed, i], offsets)
         frames = clip[rows] if isinstance(clip, np.ndarray) else clip.frames(rows)
         touch.append(torch.from_numpy(preprocess(frames, background)).half()[where])
-    return TouchFrames.from_samples(touch, None, sensor, offsets)
+    return TouchFrames(torch.cat(touch), None, sensor, _stride(offsets))
+
+
+def _stride(offsets: tuple[int, ...]) -> int:
+    return offsets[1] if len(offsets) > 1 else 1
 
 
 def _draw_rows(
-    length: int, count: int, seed: list[int], offsets: tuple[int, ...] | None
+    length: int, count: int, seed: list[int], offsets: tuple[int, ...]
 ) -> tuple[Int[np.ndarray, " k"], list[int], Int[Tensor, "k t"]]:
     """Return the drawn rows, all rows to read for them, and where among these each frame is."""
     drawn = np.sort(np.random.default_rng(seed).permutation(length)[:count])
-    rows, where = np.unique(past_rows(drawn, offsets or (0,)), return_inverse=True)
+    rows, where = np.unique(past_rows(drawn, offsets), return_inverse=True)
     return drawn, rows.tolist(), torch.from_numpy(where.reshape(len(drawn), -1))
 
 
 def find_sensor_name(sensor: str | None, *sets: EpisodeSet) -> str:
-    """Return the fingertip sensor of all episodes.
+    """Return the fingertip sensor of all episodes; `sensor` is that of those that do not name theirs.
 
     UserError: unknown, not named, or not the same in all episodes.
-
-    Args:
-        sensor: Its name, for episodes that do not name theirs.
     """
     sensor = sensor or str(sets[0].meta(0).get("sensor", ""))
     if not sensor:

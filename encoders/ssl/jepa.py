@@ -122,7 +122,7 @@ class IJepa(JointEmbeddingPrediction):
         self, touch: Tensor, context_ids: Int[Tensor, "b k"], target_ids: Int[Tensor, "b m j"]
     ) -> dict[str, Float[Tensor, ""]]:
         """Return the loss: smooth L1 distance of predicted and actual tokens, as released."""
-        images = self.stacked(touch)
+        images = self.backbone.stack(touch.float())
         actual = gather_tokens(self.targets(images), target_ids)
         predicted = self.predict(self.backbone.vit.embed_patches(images), context_ids, target_ids)
         return {"loss": F.smooth_l1_loss(predicted, actual)}
@@ -167,7 +167,7 @@ class VJepa(JointEmbeddingPrediction):
         target_ids: list[Int[Tensor, "b 1 _"]],
     ) -> dict[str, Float[Tensor, ""]]:
         """Return the loss: L1 distance of predicted and actual tokens, the mean over both masks."""
-        images = self.stacked(touch)
+        images = self.backbone.stack(touch.float())
         targets, patches = self.targets(images), self.backbone.vit.embed_patches(images)
         losses = [
             F.l1_loss(self.predict(patches, context, target), gather_tokens(targets, target))

@@ -4,7 +4,6 @@ import torch
 from jaxtyping import Float, Float16, Int
 from torch import Tensor, nn
 
-from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.sparsh import backbone_for
 from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
@@ -48,7 +47,7 @@ class MaskedAutoencoder(nn.Module):
         self._check_mask(vit)
 
     def forward(
-        self, touch: Float16[Tensor, "b *t 3 h w"], ids_keep: Int[Tensor, "b k"]
+        self, touch: Float16[Tensor, "b t 3 h w"], ids_keep: Int[Tensor, "b k"]
     ) -> dict[str, Float[Tensor, ""]]:
         """Return the loss: the mean squared error of the reconstructed patches, in the preprocessor's units.
 
@@ -56,7 +55,7 @@ class MaskedAutoencoder(nn.Module):
         to variance 1, as in He et al.: most of a touch is untouched, and would become noise at full
         size.
         """
-        images = self.images(touch)
+        images = self.backbone.stack(touch.float())
         actual = patchify(images, self.backbone.config.vit)
         error = (self.reconstruct(images, ids_keep) - actual) ** 2
         if self.config.bottleneck:
@@ -68,11 +67,6 @@ class MaskedAutoencoder(nn.Module):
         """Draw the patches that the backbone reads: `ids_keep` (count, k)."""
         vit = self.backbone.config.vit
         return {"ids_keep": random_masking(vit, self.config.mask_ratio, count, generator)}
-
-    def images(self, touch: Float16[Tensor, "b *t 3 h w"]) -> Float[Tensor, "b c h w"]:
-        """Return the backbone's input; of two frames the newer one's channels come first."""
-        touch = touch.float()
-        return stack_frames(touch, self.backbone.config.vit) if self.config.stacked else touch
 
     def reconstruct(
         self, touch: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"]
@@ -115,7 +109,8 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
         touch = batch.to(device)
         ids_keep = model.draw(len(touch), generator)["ids_keep"].to(device)
         total += model(touch, ids_keep)["loss"].item() * len(touch)
-        blank += patchify(model.images(touch), vit).square().mean().item() * len(touch)
+        images = model.backbone.stack(touch.float())
+        blank += patchify(images, vit).square().mean().item() * len(touch)
     return {
         "validation_loss": total / len(val),
         "validation_loss_of_blank": blank / len(val),
@@ -124,9 +119,9 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
 
 
 def _embed(model: MaskedAutoencoder, touch: Tensor) -> Tensor:
-    device = model.backbone.device
-    batches = (model.images(batch.to(device)) for batch in touch.split(BATCH))
-    return torch.cat([model.backbone.embed_touch(batch) for batch in batches]).cpu()
+    backbone = model.backbone
+    batches = (backbone.stack(batch.to(backbone.device).float()) for batch in touch.split(BATCH))
+    return torch.cat([backbone.embed_touch(batch) for batch in batches]).cpu()
 
 
 def progress_line(metrics: dict[str, float]) -> str:

@@ -7,10 +7,9 @@ import copy
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor, nn
 
-from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.ssl.config import SelfDistillationConfig
 
@@ -18,13 +17,6 @@ from touchgoal.encoders.ssl.config import SelfDistillationConfig
 def frozen_copy(module: nn.Module) -> Any:
     """Return a copy without gradients."""
     return copy.deepcopy(module).requires_grad_(False)
-
-
-@torch.no_grad()
-def update_average(average: nn.Module, module: nn.Module, momentum: float) -> None:
-    """Update a moving average: average <- momentum * average + (1 - momentum) * module."""
-    for mean, weight in zip(average.parameters(), module.parameters(), strict=True):
-        mean.lerp_(weight, 1 - momentum)
 
 
 class SelfDistillation(nn.Module):
@@ -58,14 +50,12 @@ class SelfDistillation(nn.Module):
         """Return the share of the training that is done."""
         return min(self.step.item() / self._steps, 1.0)
 
+    @torch.no_grad()
     def update_teacher(self) -> None:
         """Update the averages; to be called after every update of the weights."""
         first, last = self._momentum
         momentum = first + self.done * (last - first)
         for average, module in self.averaged():
-            update_average(average, module, momentum)
+            for mean, weight in zip(average.parameters(), module.parameters(), strict=True):
+                mean.lerp_(weight, 1 - momentum)
         self.step += 1
-
-    def stacked(self, touch: Tensor) -> Float[Tensor, "b c *t h w"]:
-        """Return the network's input from touches with the frames of each newest first."""
-        return stack_frames(touch.float(), self.backbone.config.vit)

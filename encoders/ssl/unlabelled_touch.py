@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import provenance
 
-Offsets = tuple[int, ...] | None
-Draw = Callable[[int, int, Offsets], frames.TouchFrames]
+Draw = Callable[[int, int, tuple[int, ...]], frames.TouchFrames]
 """Draws a number of samples from each episode or recording by a seed; see `sample_frames`."""
 
 
@@ -53,12 +53,8 @@ class _Source:
     def draw(self, recordings: Sequence[frames.Recording]) -> Draw:
         """Return a function that draws from the episode set, or else from these recordings."""
         if (episodes := self.episodes) is not None:
-            return lambda count, seed, offsets: frames.sample_frames(
-                episodes, self.sensor, count, seed, offsets
-            )
-        return lambda count, seed, offsets: frames.sample_recordings(
-            recordings, count, seed, offsets
-        )
+            return partial(frames.sample_frames, episodes, self.sensor)
+        return partial(frames.sample_recordings, recordings)
 
 
 def open_touch(
@@ -124,14 +120,14 @@ def _open(folder: Path, sensor: str | None, keys: Mapping[str, str] | None) -> _
     if is_pattern(folder) or (folder / "meta").exists():
         episodes = load_episodes(folder, keys)
         return _Source(folder, frames.find_sensor_name(sensor, episodes), episodes)
-    if labelled := has_labels(folder):
+    if has_labels(folder):
         found = read_labelled_videos(folder)
+        if all(video.held_out for video in found):
+            raise UserError(
+                f"{folder} has no video to train on: name the split train or unlabelled in labels.csv"
+            )
     else:
         found = read_recordings(folder, sensor)
-    if labelled and all(video.held_out for video in found):
-        raise UserError(
-            f"{folder} has no video to train on: name the split train or unlabelled in labels.csv"
-        )
     recorded = found[0].sensor
     if sensor not in (None, recorded):
         raise UserError(f"{folder} was recorded with {recorded}, not {sensor}")

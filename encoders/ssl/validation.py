@@ -7,7 +7,6 @@ from accelerate.utils import send_to_device
 from jaxtyping import Float
 from torch import Tensor
 
-from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.touch_backbone import BATCH
 from touchgoal.encoders.backbones.vit import patchify
 from touchgoal.encoders.ssl.frames import TouchFrames
@@ -83,7 +82,7 @@ class Validation:
     def _of_batches(self, touch: Tensor, network: Callable[[Tensor], Tensor]) -> Tensor:
         teacher = self._model.teacher
         batches = touch.split(BATCH)
-        stacked = (stack_frames(b.to(teacher.device).float(), teacher.config.vit) for b in batches)
+        stacked = (teacher.stack(b.to(teacher.device).float()) for b in batches)
         return torch.cat([network(images).float().cpu() for images in stacked])
 
     def _pixels(self, data: TouchFrames) -> Float[Tensor, "n p c"]:

@@ -90,10 +90,6 @@ def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, A
     ]
 
 
-def _nothing(*_: Any) -> None:
-    pass
-
-
 @dataclass(eq=False)
 class Training:
     """A training: its loss, its data and its callbacks."""
@@ -108,10 +104,10 @@ class Training:
     identity: Mapping[str, Any]  # JSON-able: data and settings; a run resumes only with the same
     evaluate: Callable[[], Metrics] = dict  # after every epoch: metrics to record beside the losses
     progress: Callable[[Metrics], str] = str  # returns the line to print for an epoch's metrics
-    after_step: Callable[[], None] = _nothing  # called after every update of the weights
+    after_step: Callable[[], object] = lambda: None  # called after every update of the weights
     # called with all metrics so far and the provenance before the checkpoint is written; in every
     # process, see `on_first_process`
-    after_epoch: Callable[[list[Metrics], dict[str, Any]], None] = _nothing
+    after_epoch: Callable[[list[Metrics], dict[str, Any]], object] = lambda *_: None
     # further objects with `state_dict` and `load_state_dict` for the checkpoint
     extra_state: dict[str, Any] = field(default_factory=dict)
 

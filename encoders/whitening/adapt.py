@@ -21,12 +21,9 @@ _SHARE = 0.1
 
 
 def adapt(encoder: PooledEncoder, videos: list[LabelledVideo], towers: Towers) -> PooledEncoder:
-    """Return an encoder adapted to videos; ranks in them replace its sentences.
+    """Return an encoder adapted to videos; ranks in them replace its sentences by these towers'.
 
     UserError: no object has two videos.
-
-    Args:
-        towers: towers whose sentences are fitted to the ranks.
     """
     objects = np.array([video.object for video in videos])
     if not videos or np.unique(objects, return_counts=True)[1].max() < 2:

@@ -217,8 +217,6 @@ def read_columns(
         )
         for key, feature in features.items()
     }
-    if not features:
-        return out
     sizes = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
     ends = np.cumsum(sizes)
     group_of = np.searchsorted(ends, frames, side="right")

@@ -42,15 +42,15 @@ class EpisodePlace:
     videos: dict[str, VideoPlace]  # by key as stored
 
 
-def load_table(root: Path, leave_out: str | None = None) -> pa.Table:
-    """Return meta/episodes, of all its files, without the columns that begin with `leave_out`.
+def load_table(root: Path) -> pa.Table:
+    """Return meta/episodes, of all its files, without the statistics.
 
     Its schema has metadata, such as touchgoal's mark, only if those of every file are the same.
 
     UserError: a file is missing or broken, or their columns are not of one type.
     """
     names = set_files.episodes_files(root)
-    tables = [set_files.read_parquet(root, name, leave_out) for name in names]
+    tables = [set_files.read_parquet(root, name, leave_out="stats/") for name in names]
     try:
         joined = pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
@@ -89,9 +89,6 @@ class EpisodePlaces:
             raise set_files.unreadable(root, name, ValueError(f"no column {error}")) from error
         except (TypeError, ValueError, pa.ArrowException) as error:
             raise set_files.unreadable(root, set_files.EPISODES, error) from error
-
-    def __len__(self) -> int:
-        return len(self.lengths)
 
     def __getitem__(self, i: int) -> EpisodePlace:
         facts = self.facts(i)

@@ -31,8 +31,7 @@ def foreign_file(root: Path, features: dict[str, Any], episodes: pa.Table | None
     if other := next((path for path in others if _written_by_touchgoal(path) is False), None):
         return other
     if unknown := sorted(set(features) - {*FEATURES, *INDEX_DTYPES}):
-        error = ValueError(f"unknown feature {unknown[0]!r}")
-        return _foreign_unless_own(root, set_files.INFO, error)
+        return _foreign_unless_own(root, set_files.INFO, f"unknown feature {unknown[0]!r}")
     if episodes is None or not episodes.num_rows:
         return None
     cameras = [key for key, feature in features.items() if feature["dtype"] == "video"]
@@ -40,17 +39,16 @@ def foreign_file(root: Path, features: dict[str, Any], episodes: pa.Table | None
     numbers = ["data/chunk_index", "data/file_index"]
     distinct = episodes.select(numbers).group_by(numbers).aggregate([]).num_rows
     if unchecked or distinct < episodes.num_rows:
-        error = ValueError("wrong places of files")
-        return _foreign_unless_own(root, set_files.EPISODES, error)
+        return _foreign_unless_own(root, set_files.EPISODES, "wrong places of files")
     last = fetched(root, set_files.data_path_of(set_files.last_row(episodes)))
     return last if _written_by_touchgoal(last) is False else None
 
 
-def _foreign_unless_own(root: Path, name: str, error: ValueError) -> Path:
+def _foreign_unless_own(root: Path, name: str, reason: str) -> Path:
     """Return a foreign data file; raise that `name` is corrupt if touchgoal wrote them all."""
     if path := foreign_data_file(root, if_none=root / name):
         return path
-    raise set_files.unreadable(root, name, error)
+    raise set_files.unreadable(root, name, ValueError(reason))
 
 
 def foreign_data_file(root: Path, if_none: Path | None = None) -> Path | None:

@@ -39,16 +39,8 @@ class JoinedSet(EpisodeSet):
         self.root, self.fps, self.keys, self.features = root, first.fps, first.keys, first.features
         self.sets = tuple(sets)
         self.foreign = any(one.foreign for one in sets)
-        self._lengths = [length for one in sets for length in one.lengths]
+        self.lengths = [length for one in sets for length in one.lengths]
         self._ends = np.cumsum([len(one) for one in sets])
-
-    def __len__(self) -> int:
-        return len(self._lengths)
-
-    @property
-    def lengths(self) -> list[int]:
-        """Number of frames of every episode."""
-        return self._lengths
 
     @cached_property
     def checksum(self) -> str:

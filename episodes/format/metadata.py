@@ -250,14 +250,9 @@ def _with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
 
 
 def _schema(row: Row) -> pa.Schema:
-    return pa.schema([(name, _arrow_type(value)) for name, value in row.items()])
-
-
-def _arrow_type(value: Any) -> pa.DataType:
-    if isinstance(value, list):
-        return pa.list_(_arrow_type(value[0]) if value else pa.string())
-    types = {str: pa.string(), bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
-    return next(types[kind] for kind in types if isinstance(value, kind))
+    types = {name: pa.infer_type([value]) for name, value in row.items()}
+    empty, texts = pa.list_(pa.null()), pa.list_(pa.string())
+    return pa.schema([(name, texts if found == empty else found) for name, found in types.items()])
 
 
 def _tasks_table(tasks: tuple[str, ...]) -> pa.Table:

@@ -1,9 +1,9 @@
 """Check of a set of episodes, and repair after a crash or damage."""
 
-import itertools
 import os
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -191,11 +191,8 @@ def _rewrite_index_columns(
 
 def _move_to_repaired(root: Path, name: str) -> str:
     """Move a file of the set into `repaired/`, beside what an earlier repair moved there."""
-    target = root / REPAIRED / name
-    for i in itertools.count(1):
-        if not target.exists():
-            break
-        target = root / REPAIRED / f"{name}.{i}"
+    names = chain([name], (f"{name}.{i}" for i in count(1)))
+    target = next(path for free in names if not (path := root / REPAIRED / free).exists())
     target.parent.mkdir(parents=True, exist_ok=True)
     os.replace(root / name, target)
     return f"moved {root / name} to {target}"

@@ -209,11 +209,8 @@ def _joints(stream: Stream) -> tuple[tuple[int | str, ...], tuple[int | str, ...
         return tuple(range(n)), tuple(range(n, stream.shape[0]))[:2]
     fingers = tuple(n for n in stream.names if re.search("finger|gripper", n))
     arm = [n for n in stream.names if n not in fingers]
-    return tuple(sorted(arm, key=_numbered)), fingers[:2]
-
-
-def _numbered(name: str) -> tuple[int, ...]:
-    return tuple(map(int, re.findall(r"\d+", name)[-1:]))
+    arm.sort(key=lambda name: [int(digits) for digits in re.findall(r"\d+", name)[-1:]])
+    return tuple(arm), fingers[:2]
 
 
 def _in_degrees(stream: Stream, arm: tuple[int | str, ...]) -> float:

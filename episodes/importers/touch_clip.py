@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 from PIL import Image as PILImage
 
+from touchgoal.control.arrays import Image
 from touchgoal.control.sensors.image_integrity import JpegDecoder
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
@@ -18,8 +19,6 @@ from touchgoal.runtime.image_file import decode_image
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk with its checksum
 _MEDIAN_IMAGES = 25  # spread over a clip, for its untouched gel
-
-Image = UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True, eq=False)

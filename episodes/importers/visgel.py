@@ -68,13 +68,9 @@ def read_visgel_list(path: Path) -> list[VisGelRecording]:
 
 
 def find_root(path: Path, root: Path | None, recording: VisGelRecording) -> Path:
-    """Return the folder that a list's paths are relative to.
+    """Return the folder that a list's paths are relative to: `root`, or the one that holds `data_lst`.
 
-    UserError: the reference is not there.
-
-    Args:
-        root: Folder that the user named; None for the one that holds `data_lst`.
-        recording: A recording, whose reference must be there.
+    UserError: the recording's reference is not there.
     """
     found = root or path.resolve().parent.parent
     if not (found / recording.reference[0]).is_file():
