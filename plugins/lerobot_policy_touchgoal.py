@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from accelerate.utils import send_to_device
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -107,8 +108,7 @@ class TouchgoalPolicy(PreTrainedPolicy):
         windows = make_batch(self._windows, rows)
         if not torch.equal(windows["actions"], batch["action"].float().cpu()):
             raise ValueError(f"lerobot loads another set than {self.config.data}: actions differ")
-        device = batch["action"].device
-        on_device = {k: v if v is None else v.to(device) for k, v in windows.items()}
+        on_device = send_to_device(windows, batch["action"].device)
         noise = BatchNoise(torch.default_generator)
         return PolicyLoss(self.network)(**on_device, noise=noise)["loss"], None
 

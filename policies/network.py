@@ -127,6 +127,12 @@ class ObservationBatch:
         """Joint positions measured at the latest tick, rad."""
         return self.state[:, -1, : ft.N_JOINTS]
 
+    def to(self, device: torch.device) -> "ObservationBatch":
+        """Return the batch on another device; Accelerate looks for this."""
+        return ObservationBatch(
+            **{k: x if x is None else x.to(device) for k, x in vars(self).items()}
+        )
+
 
 class Plan(NamedTuple):
     """Actions, and whether the task looks done."""
@@ -205,8 +211,7 @@ class PolicyNetwork(nn.Module):
         self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"] | None = None
     ) -> Float[Tensor, "b c"]:
         """Return what the head reads, with cameras at true key poses."""
-        pose = None if key_pose is None else self._true_pose(batch, key_pose)
-        return self._encode(batch, self._encode_touch(batch), pose)
+        return self._encode(batch, self._true_pose(batch, key_pose))
 
     def loss(
         self,
@@ -235,7 +240,7 @@ class PolicyNetwork(nn.Module):
         if pose is not None and self.config.representation == "body_twist":
             pose, chunk = kp.face_any_way(pose, chunk, noise)
             pose, chunk = kp.set_beside(pose, chunk, noise)
-        encoded = self._encode(batch, self._encode_touch(batch, noise), pose, noise)
+        encoded = self._encode(batch, pose, noise)
         loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
         return loss + key_pose_loss
 
@@ -267,15 +272,14 @@ class PolicyNetwork(nn.Module):
         (m), the last plan's, until the hand is at the next key pose; this needs the `average` of the
         episode's estimates, or the true key poses.
         """
-        keeps, pose = average is not None and average.gripper_moves, None
-        if self.key_pose and key_pose is not None:
-            pose = self._true_pose(batch, key_pose)
-        elif self.key_pose:
+        keeps = average is not None and average.gripper_moves
+        pose = self._true_pose(batch, key_pose)
+        if self.key_pose and pose is None:
             assert average is not None, "needs the episode's average, or the true key poses"
             maps, hand = self.seen(batch)
             estimate, weight = self.key_pose(maps, hand)
             pose = average.add(estimate, weight, hand[:, :7])
-        encoded = self._encode(batch, self._encode_touch(batch), pose)
+        encoded = self._encode(batch, pose)
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)
         if widths := self.config.gripper_widths:
@@ -288,31 +292,26 @@ class PolicyNetwork(nn.Module):
         return Plan(actions, never if self.end is None else self.end(encoded) > self.end.limit)
 
     def _true_pose(
-        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]
-    ) -> Float[Tensor, "b 11"]:
+        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"] | None
+    ) -> Float[Tensor, "b 11"] | None:
+        if key_pose is None:
+            return None
         return kp.true_pose(self._hand(batch.state[:, -1])[:, :7], key_pose)
-
-    def _encode_touch(
-        self, batch: ObservationBatch, noise: BatchNoise | None = None
-    ) -> Float[Tensor, "b o w"]:
-        """Return the head's touch input, with the training's noise if given."""
-        if self.touch_readout is None:
-            return batch.state[..., :0]
-        touch = self.touch_normalizer(batch.touch).clamp(-_CLIP, _CLIP)
-        if noise is not None:
-            noise_drawn = noise.randn(touch.shape).to(touch)
-            touch = touch + self.config.touch_noise * noise_drawn
-        return self.touch_readout(touch)
 
     def _encode(
         self,
         batch: ObservationBatch,
-        touch: Float[Tensor, "b o w"],
         pose: Float[Tensor, "b 11"] | None,
         noise: BatchNoise | None = None,
     ) -> Float[Tensor, "b c"]:
-        """Return the head's whole input, with the training's noise if given."""
+        """Return what the head reads, with the training's noise if given."""
         columns, kind = self.config.proprioception, self.config.representation
+        touch = batch.state[..., :0]
+        if self.touch_readout is not None:
+            touch = self.touch_normalizer(batch.touch).clamp(-_CLIP, _CLIP)
+            if noise is not None:
+                touch = touch + self.config.touch_noise * noise.randn(touch.shape).to(touch)
+            touch = self.touch_readout(touch)
         state = network_input(batch.state, columns, kind)
         state = self.state_normalizer(state).clamp(-_CLIP, _CLIP)
         if self.key_pose:  # it would repeat its last motion (de Haan et al. 2019), and come to rest

@@ -18,15 +18,13 @@ from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 from touchgoal.policies import checkpoint
 from touchgoal.policies.config import TrainConfig
-from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
+from touchgoal.policies.network import PolicyConfig, PolicyNetwork
 from touchgoal.policies.training.end import fit_end
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
 BETAS, WEIGHT_DECAY = (0.95, 0.999), 1e-6  # of AdamW, as in diffusion_policy
 _WARMUP_STEPS = 500  # as there; a tenth of a training that is shorter
-_SEEN = "touch", "state", "images", "maps"  # of a batch, by the policy as it acts
-_LEARNED = "actions", "noise", "action_is_pad", "key_pose"  # and by the loss alone
 _VALIDATION_WINDOWS = 1024  # evenly spaced, for the losses
 
 
@@ -63,7 +61,7 @@ def train(
             folders.append(out_dir / SNAPSHOTS / f"epoch-{len(history):04d}")
         if folders and averaged.key_pose:
             batch = _validation_batch(averaged, validation)
-            averaged.key_pose.calibrate(*averaged.seen(_observed(batch)), batch["key_pose"][:, 1:])
+            averaged.key_pose.calibrate(*averaged.seen(batch["batch"]), batch["key_pose"][:, 1:])
         if folders and averaged.end:  # how many validation episodes it ends, of how many
             known["ended"] = fit_end(averaged, windows, validation, options.seed)
         for folder in folders:
@@ -133,18 +131,14 @@ class PolicyLoss(nn.Module):
 
     def forward(self, **batch: Any) -> dict[str, Tensor]:
         """Return "loss"."""
-        observed = _observed(batch)
-        return {"loss": self.policy.loss(observed, **{name: batch[name] for name in _LEARNED})}
+        return {"loss": self.policy.loss(**batch)}
 
 
 def make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, Any]:
     """Return some windows as `PolicyLoss` takes them, but for the noise."""
     observed, actions = windows.take(rows)
     return {
-        "touch": observed.touch,
-        "state": observed.state,
-        "images": observed.images,
-        "maps": observed.maps,
+        "batch": observed,
         "actions": actions,
         "action_is_pad": windows.action_is_pad[rows],
         "key_pose": windows.key_pose(rows),
@@ -159,16 +153,12 @@ def _validation_batch(policy: PolicyNetwork, windows: SequenceDataset) -> dict[s
     return cast(dict[str, Any], send_to_device(make_batch(windows, rows), device))
 
 
-def _observed(batch: dict[str, Any]) -> ObservationBatch:
-    return ObservationBatch(**{name: batch[name] for name in _SEEN})
-
-
 @torch.no_grad()
 def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dict[str, float]:
     """Return the loss, the error of the joint change (rad) planned over the chunk, and of key poses (m)."""
     batch = _validation_batch(policy, windows)
     generator = torch.Generator().manual_seed(seed)
-    observed = _observed(batch)
+    observed = batch["batch"]
     planned = policy.plan(observed, generator, key_pose=batch["key_pose"]).actions
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
