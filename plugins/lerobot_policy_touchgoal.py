@@ -29,14 +29,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import ESTIMATOR, TOUCH, SavedPolicy, find_policy, save
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
-from touchgoal.policies.training.train import (
-    BETAS,
-    POLICY,
-    WEIGHT_DECAY,
-    PolicyLoss,
-    make_batch,
-    untrained,
-)
+from touchgoal.policies.training.train import BETAS, POLICY, WEIGHT_DECAY, make_batch, untrained
 
 DATA_MISSING = "--policy.data=FOLDER names the set that lerobot loads, to train on it"
 """Message where it is not named."""
@@ -110,7 +103,7 @@ class TouchgoalPolicy(PreTrainedPolicy):
             raise ValueError(f"lerobot loads another set than {self.config.data}: actions differ")
         on_device = send_to_device(windows, batch["action"].device)
         noise = BatchNoise(torch.default_generator)
-        return PolicyLoss(self.network)(**on_device, noise=noise)["loss"], None
+        return self.network(**on_device, noise=noise)["loss"], None
 
     def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
         super()._save_pretrained(save_directory, state_dict)

@@ -10,13 +10,7 @@ from torch import Tensor, nn
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.batch_noise import BatchNoise
-from touchgoal.policies.actions import (
-    ACTION_DIM,
-    Normalizer,
-    nearest,
-    to_actions,
-    to_representation,
-)
+from touchgoal.policies.actions import ACTION_DIM, Normalizer, to_actions, to_representation
 from touchgoal.policies.config import ActionRepresentation
 from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig, Regression
 from touchgoal.policies.heads.end import EndOutput
@@ -213,15 +207,15 @@ class PolicyNetwork(nn.Module):
         """Return what the head reads, with cameras at true key poses."""
         return self._encode(batch, self._true_pose(batch, key_pose))
 
-    def loss(
+    def forward(
         self,
         batch: ObservationBatch,
         actions: Float[Tensor, "b h 8"],
         noise: BatchNoise,
         action_is_pad: Bool[Tensor, "b h"] | None = None,
         key_pose: Float[Tensor, "b 3 8"] | None = None,
-    ) -> Float[Tensor, ""]:
-        """Return the training loss on windows, without ticks after the episode's end.
+    ) -> dict[str, Tensor]:
+        """Return the training's "loss" on windows, without ticks after the episode's end.
 
         With cameras it needs the next key poses.
         """
@@ -242,7 +236,7 @@ class PolicyNetwork(nn.Module):
             pose, chunk = kp.set_beside(pose, chunk, noise)
         encoded = self._encode(batch, pose, noise)
         loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
-        return loss + key_pose_loss
+        return {"loss": loss + key_pose_loss}
 
     def seen(
         self, batch: ObservationBatch
@@ -283,7 +277,8 @@ class PolicyNetwork(nn.Module):
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)
         if widths := self.config.gripper_widths:
-            actions[..., -1] = nearest(actions[..., -1], widths)
+            levels = torch.tensor(widths).to(actions)
+            actions[..., -1] = levels[(actions[..., -1:] - levels).abs().argmin(-1)]
             if pose is not None and width is not None:
                 tcp = torch.stack([self._hand(state)[:, :7] for state in batch.state.unbind(1)], 1)
                 planned = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)

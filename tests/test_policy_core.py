@@ -77,7 +77,7 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     policy = toy_policy(config, dataset)
     losses = []
     for chunk in (actions, other):
-        loss = policy.loss(batch, chunk, BatchNoise(torch_rng()), is_pad)
+        loss = policy(batch, chunk, BatchNoise(torch_rng()), is_pad)["loss"]
         losses.append(torch.autograd.grad(loss, list(policy.head.parameters())))
     if isinstance(head, MLPConfig):  # a U-Net sees the padding, noised, beside the rest
         for one, two in zip(*losses, strict=True):
@@ -109,7 +109,7 @@ def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
     condition, actions = windows.take(rows)
     optimiser, generator = torch.optim.Adam(policy.parameters(), 5e-3), torch_rng()
     for _ in range(120):
-        loss = policy.loss(condition, actions, BatchNoise(generator), windows.action_is_pad)
+        loss = policy(condition, actions, BatchNoise(generator), windows.action_is_pad)["loss"]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from accelerate.utils import send_to_device
 from jaxtyping import Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 
 from touchgoal.encoders.training.batch_noise import BatchNoise
@@ -68,7 +68,7 @@ def train(
             on_first_process(partial(checkpoint.save, averaged, folder, provenance | known))
 
     training = Training(
-        loss=PolicyLoss(network),
+        loss=network,
         n_samples=len(windows),
         batch=lambda rows, noise: make_batch(windows, windows.draw(rows, noise)) | {"noise": noise},
         optimizer=OptimizerConfig(
@@ -122,20 +122,8 @@ def _update_average(average: Sequence[Tensor], weights: Sequence[Tensor], n_aver
         mean.lerp_(weight, 1 - ema_decay(int(n_averaged)))
 
 
-class PolicyLoss(nn.Module):
-    """Training loss of a policy on what `make_batch` returns, with the `BatchNoise` as "noise"."""
-
-    def __init__(self, policy: PolicyNetwork) -> None:
-        super().__init__()
-        self.policy = policy
-
-    def forward(self, **batch: Any) -> dict[str, Tensor]:
-        """Return "loss"."""
-        return {"loss": self.policy.loss(**batch)}
-
-
 def make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, Any]:
-    """Return some windows as `PolicyLoss` takes them, but for the noise."""
+    """Return some windows as a `PolicyNetwork` takes them in training, but for the noise."""
     observed, actions = windows.take(rows)
     return {
         "batch": observed,
@@ -163,7 +151,7 @@ def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dic
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
     error = off.sum(1).norm(dim=1).mean()
-    loss = PolicyLoss(policy)(**batch, noise=BatchNoise(generator))["loss"]
+    loss = policy(**batch, noise=BatchNoise(generator))["loss"]
     metrics = {"validation_loss": loss.item(), "validation_error": error.item()}
     if policy.key_pose:
         off = policy.key_pose.error(*policy.seen(observed), batch["key_pose"][:, 1:])
