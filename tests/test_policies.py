@@ -38,7 +38,7 @@ from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.policies.training.training_data import (
     choose_episodes,
     choose_judged,
-    common_sensor,
+    common_fact,
     find_task,
 )
 from touchgoal.runtime.errors import UserError
@@ -342,7 +342,7 @@ def test_only_what_is_known_to_be_good_is_learned_from(tmp_path: Path) -> None:
     assert find_task([(episodes, [0, 1]), (episodes, [2])], None) == "bead-maze"
     with pytest.raises(UserError, match="more than one task"):
         find_task([(episodes, [0]), (arm, [0])], None)
-    assert common_sensor([(arm, [0])]) == "digit"
+    assert common_fact("sensor", [(arm, [0])]) == "digit"
 
 
 def test_the_films_show_the_trials(tmp_path: Path) -> None:
