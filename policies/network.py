@@ -123,9 +123,8 @@ class ObservationBatch:
 
     def to(self, device: torch.device) -> "ObservationBatch":
         """Return the batch on another device; Accelerate looks for this."""
-        return ObservationBatch(
-            **{k: x if x is None else x.to(device) for k, x in vars(self).items()}
-        )
+        images, maps = (x if x is None else x.to(device) for x in (self.images, self.maps))
+        return ObservationBatch(self.touch.to(device), self.state.to(device), images, maps)
 
 
 class Plan(NamedTuple):
@@ -171,7 +170,7 @@ class PolicyNetwork(nn.Module):
         state: Float[Tensor, "n s"],
         joints: Float[Tensor, "m 7"],
         actions: Float[Tensor, "m h 8"],
-        action_is_pad: Bool[Tensor, "m h"] | None = None,
+        action_is_pad: Bool[Tensor, "m h"],
         maps: Float16[Tensor, "n k c y x"] | None = None,
         key_pose: Float[Tensor, "n 3 8"] | None = None,
     ) -> None:
@@ -187,8 +186,8 @@ class PolicyNetwork(nn.Module):
             self.key_pose.fit(maps, self._hand(state), key_pose[:, 1:])
         columns, kind = self.config.proprioception, self.config.representation
         self.state_normalizer.fit_mean_std(network_input(state, columns, kind))
-        valid = None if action_is_pad is None else ~action_is_pad[..., None]
         chunks = to_representation(actions, joints, kind)
+        valid = ~action_is_pad[..., None]
         self.action_normalizer.fit_range(chunks, valid, self.config.action_share)
 
     def fit_novelty(self, touch: Float[Tensor, "n e"], lengths: Sequence[int]) -> None:
@@ -212,7 +211,7 @@ class PolicyNetwork(nn.Module):
         batch: ObservationBatch,
         actions: Float[Tensor, "b h 8"],
         noise: BatchNoise,
-        action_is_pad: Bool[Tensor, "b h"] | None = None,
+        action_is_pad: Bool[Tensor, "b h"],
         key_pose: Float[Tensor, "b 3 8"] | None = None,
     ) -> dict[str, Tensor]:
         """Return the training's "loss" on windows, without ticks after the episode's end.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from accelerate.utils import send_to_device
 from toy_policies import (
     DIFFUSION,
     FLOW,
@@ -90,6 +91,13 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     for name, scale in toy_policy(config, wild).named_buffers():
         if name.startswith("action_normalizer"):
             torch.testing.assert_close(scale, dict(policy.named_buffers())[name])
+
+
+def test_accelerate_moves_observations_to_a_device() -> None:
+    batch, _ = toy_dataset(TOY).take(torch.tensor([0, 3]))
+    meta = torch.device("meta")
+    moved, _ = send_to_device((batch, None), meta)
+    assert moved.touch.device == moved.state.device == meta and moved.images is None
 
 
 @pytest.mark.parametrize(
