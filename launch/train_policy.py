@@ -199,7 +199,7 @@ def main(config: Config) -> None:
     task = training_data.find_task(chosen, config.task)
     simulated = cast(TaskName, task) if task in TASKS else None
     trials = config.trials if simulated else 0
-    sensor = training_data.common_sensor(chosen) if config.encoder else ""
+    sensor = training_data.common_fact("sensor", chosen) if config.encoder else ""
     env = _env(config.env, simulated, sensor) if simulated else None
     policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
     for one in sets:

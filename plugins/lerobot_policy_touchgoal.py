@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from accelerate.utils import send_to_device
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -28,14 +29,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import ESTIMATOR, TOUCH, SavedPolicy, find_policy, save
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
-from touchgoal.policies.training.train import (
-    BETAS,
-    POLICY,
-    WEIGHT_DECAY,
-    PolicyLoss,
-    make_batch,
-    untrained,
-)
+from touchgoal.policies.training.train import BETAS, POLICY, WEIGHT_DECAY, make_batch, untrained
 
 DATA_MISSING = "--policy.data=FOLDER names the set that lerobot loads, to train on it"
 """Message where it is not named."""
@@ -107,10 +101,9 @@ class TouchgoalPolicy(PreTrainedPolicy):
         windows = make_batch(self._windows, rows)
         if not torch.equal(windows["actions"], batch["action"].float().cpu()):
             raise ValueError(f"lerobot loads another set than {self.config.data}: actions differ")
-        device = batch["action"].device
-        on_device = {k: v if v is None else v.to(device) for k, v in windows.items()}
+        on_device = send_to_device(windows, batch["action"].device)
         noise = BatchNoise(torch.default_generator)
-        return PolicyLoss(self.network)(**on_device, noise=noise)["loss"], None
+        return self.network(**on_device, noise=noise)["loss"], None
 
     def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
         super()._save_pretrained(save_directory, state_dict)

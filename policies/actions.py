@@ -63,12 +63,6 @@ def _base_jacobian_and_elbow(joints: Float[Tensor, "b 7"]) -> Float[Tensor, "b 7
     return torch.cat([torch.from_numpy(rows).float(), elbow], 1).to(joints)
 
 
-def nearest(widths: Float[Tensor, "b h"], allowed: tuple[float, ...]) -> Float[Tensor, "b h"]:
-    """Return for each width (m) the nearest allowed one."""
-    levels = torch.tensor(allowed).to(widths)
-    return levels[(widths[..., None] - levels).abs().argmin(-1)]
-
-
 def body_jacobian(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 6 7"]:
     """Return the Jacobian of the TCP's displacement and rotation along its own axes."""
     columns = joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64)

@@ -10,13 +10,7 @@ from torch import Tensor, nn
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.batch_noise import BatchNoise
-from touchgoal.policies.actions import (
-    ACTION_DIM,
-    Normalizer,
-    nearest,
-    to_actions,
-    to_representation,
-)
+from touchgoal.policies.actions import ACTION_DIM, Normalizer, to_actions, to_representation
 from touchgoal.policies.config import ActionRepresentation
 from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig, Regression
 from touchgoal.policies.heads.end import EndOutput
@@ -127,6 +121,11 @@ class ObservationBatch:
         """Joint positions measured at the latest tick, rad."""
         return self.state[:, -1, : ft.N_JOINTS]
 
+    def to(self, device: torch.device) -> "ObservationBatch":
+        """Return the batch on another device; Accelerate looks for this."""
+        images, maps = (x if x is None else x.to(device) for x in (self.images, self.maps))
+        return ObservationBatch(self.touch.to(device), self.state.to(device), images, maps)
+
 
 class Plan(NamedTuple):
     """Actions, and whether the task looks done."""
@@ -171,7 +170,7 @@ class PolicyNetwork(nn.Module):
         state: Float[Tensor, "n s"],
         joints: Float[Tensor, "m 7"],
         actions: Float[Tensor, "m h 8"],
-        action_is_pad: Bool[Tensor, "m h"] | None = None,
+        action_is_pad: Bool[Tensor, "m h"],
         maps: Float16[Tensor, "n k c y x"] | None = None,
         key_pose: Float[Tensor, "n 3 8"] | None = None,
     ) -> None:
@@ -187,8 +186,8 @@ class PolicyNetwork(nn.Module):
             self.key_pose.fit(maps, self._hand(state), key_pose[:, 1:])
         columns, kind = self.config.proprioception, self.config.representation
         self.state_normalizer.fit_mean_std(network_input(state, columns, kind))
-        valid = None if action_is_pad is None else ~action_is_pad[..., None]
         chunks = to_representation(actions, joints, kind)
+        valid = ~action_is_pad[..., None]
         self.action_normalizer.fit_range(chunks, valid, self.config.action_share)
 
     def fit_novelty(self, touch: Float[Tensor, "n e"], lengths: Sequence[int]) -> None:
@@ -205,18 +204,17 @@ class PolicyNetwork(nn.Module):
         self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"] | None = None
     ) -> Float[Tensor, "b c"]:
         """Return what the head reads, with cameras at true key poses."""
-        pose = None if key_pose is None else self._true_pose(batch, key_pose)
-        return self._encode(batch, self._encode_touch(batch), pose)
+        return self._encode(batch, self._true_pose(batch, key_pose))
 
-    def loss(
+    def forward(
         self,
         batch: ObservationBatch,
         actions: Float[Tensor, "b h 8"],
         noise: BatchNoise,
-        action_is_pad: Bool[Tensor, "b h"] | None = None,
+        action_is_pad: Bool[Tensor, "b h"],
         key_pose: Float[Tensor, "b 3 8"] | None = None,
-    ) -> Float[Tensor, ""]:
-        """Return the training loss on windows, without ticks after the episode's end.
+    ) -> dict[str, Tensor]:
+        """Return the training's "loss" on windows, without ticks after the episode's end.
 
         With cameras it needs the next key poses.
         """
@@ -235,9 +233,9 @@ class PolicyNetwork(nn.Module):
         if pose is not None and self.config.representation == "body_twist":
             pose, chunk = kp.face_any_way(pose, chunk, noise)
             pose, chunk = kp.set_beside(pose, chunk, noise)
-        encoded = self._encode(batch, self._encode_touch(batch, noise), pose, noise)
+        encoded = self._encode(batch, pose, noise)
         loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
-        return loss + key_pose_loss
+        return {"loss": loss + key_pose_loss}
 
     def seen(
         self, batch: ObservationBatch
@@ -267,19 +265,19 @@ class PolicyNetwork(nn.Module):
         (m), the last plan's, until the hand is at the next key pose; this needs the `average` of the
         episode's estimates, or the true key poses.
         """
-        keeps, pose = average is not None and average.gripper_moves, None
-        if self.key_pose and key_pose is not None:
-            pose = self._true_pose(batch, key_pose)
-        elif self.key_pose:
+        keeps = average is not None and average.gripper_moves
+        pose = self._true_pose(batch, key_pose)
+        if self.key_pose and pose is None:
             assert average is not None, "needs the episode's average, or the true key poses"
             maps, hand = self.seen(batch)
             estimate, weight = self.key_pose(maps, hand)
             pose = average.add(estimate, weight, hand[:, :7])
-        encoded = self._encode(batch, self._encode_touch(batch), pose)
+        encoded = self._encode(batch, pose)
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         actions = to_actions(chunk, batch.joints, self.config.representation)
         if widths := self.config.gripper_widths:
-            actions[..., -1] = nearest(actions[..., -1], widths)
+            levels = torch.tensor(widths).to(actions)
+            actions[..., -1] = levels[(actions[..., -1:] - levels).abs().argmin(-1)]
             if pose is not None and width is not None:
                 tcp = torch.stack([self._hand(state)[:, :7] for state in batch.state.unbind(1)], 1)
                 planned = kp.gripper_plan(pose, tcp, actions[..., -1], width, widths)
@@ -288,31 +286,26 @@ class PolicyNetwork(nn.Module):
         return Plan(actions, never if self.end is None else self.end(encoded) > self.end.limit)
 
     def _true_pose(
-        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"]
-    ) -> Float[Tensor, "b 11"]:
+        self, batch: ObservationBatch, key_pose: Float[Tensor, "b 3 8"] | None
+    ) -> Float[Tensor, "b 11"] | None:
+        if key_pose is None:
+            return None
         return kp.true_pose(self._hand(batch.state[:, -1])[:, :7], key_pose)
-
-    def _encode_touch(
-        self, batch: ObservationBatch, noise: BatchNoise | None = None
-    ) -> Float[Tensor, "b o w"]:
-        """Return the head's touch input, with the training's noise if given."""
-        if self.touch_readout is None:
-            return batch.state[..., :0]
-        touch = self.touch_normalizer(batch.touch).clamp(-_CLIP, _CLIP)
-        if noise is not None:
-            noise_drawn = noise.randn(touch.shape).to(touch)
-            touch = touch + self.config.touch_noise * noise_drawn
-        return self.touch_readout(touch)
 
     def _encode(
         self,
         batch: ObservationBatch,
-        touch: Float[Tensor, "b o w"],
         pose: Float[Tensor, "b 11"] | None,
         noise: BatchNoise | None = None,
     ) -> Float[Tensor, "b c"]:
-        """Return the head's whole input, with the training's noise if given."""
+        """Return what the head reads, with the training's noise if given."""
         columns, kind = self.config.proprioception, self.config.representation
+        touch = batch.state[..., :0]
+        if self.touch_readout is not None:
+            touch = self.touch_normalizer(batch.touch).clamp(-_CLIP, _CLIP)
+            if noise is not None:
+                touch = touch + self.config.touch_noise * noise.randn(touch.shape).to(touch)
+            touch = self.touch_readout(touch)
         state = network_input(batch.state, columns, kind)
         state = self.state_normalizer(state).clamp(-_CLIP, _CLIP)
         if self.key_pose:  # it would repeat its last motion (de Haan et al. 2019), and come to rest

@@ -1,6 +1,5 @@
 """A reward for recordings of one kind: encoders, goals and normalizer, chosen and checked."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -48,14 +47,10 @@ class PreparedReward:
         """Return the judgement of an episode that `embedder` embedded; UserError without a judge."""
         return self.judge.judge(self.end_costs(episode))
 
-    def curves(
-        self, trajectory: EmbeddedEpisode, before: Mapping[str, float] | None = None
-    ) -> Curves:
-        """Return the curves of a trajectory that `embedder` embedded; `before`: `compute_curves`."""
+    def curves(self, trajectory: EmbeddedEpisode) -> Curves:
+        """Return the curves of a trajectory that `embedder` embedded."""
         goal = self.embedder.embed_goal(self.goals, trajectory)
-        curves = compute_curves(
-            trajectory, goal, self.normalizer, self.value, before, plain=self.plain
-        )
+        curves = compute_curves(trajectory, goal, self.normalizer, self.value, plain=self.plain)
         return replace(curves, note=self.note)
 
     def provenance(self) -> dict[str, str]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from accelerate.utils import send_to_device
 from toy_policies import (
     DIFFUSION,
     FLOW,
@@ -77,7 +78,7 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     policy = toy_policy(config, dataset)
     losses = []
     for chunk in (actions, other):
-        loss = policy.loss(batch, chunk, BatchNoise(torch_rng()), is_pad)
+        loss = policy(batch, chunk, BatchNoise(torch_rng()), is_pad)["loss"]
         losses.append(torch.autograd.grad(loss, list(policy.head.parameters())))
     if isinstance(head, MLPConfig):  # a U-Net sees the padding, noised, beside the rest
         for one, two in zip(*losses, strict=True):
@@ -90,6 +91,13 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     for name, scale in toy_policy(config, wild).named_buffers():
         if name.startswith("action_normalizer"):
             torch.testing.assert_close(scale, dict(policy.named_buffers())[name])
+
+
+def test_accelerate_moves_observations_to_a_device() -> None:
+    batch, _ = toy_dataset(TOY).take(torch.tensor([0, 3]))
+    meta = torch.device("meta")
+    moved, _ = send_to_device((batch, None), meta)
+    assert moved.touch.device == moved.state.device == meta and moved.images is None
 
 
 @pytest.mark.parametrize(
@@ -109,7 +117,7 @@ def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
     condition, actions = windows.take(rows)
     optimiser, generator = torch.optim.Adam(policy.parameters(), 5e-3), torch_rng()
     for _ in range(120):
-        loss = policy.loss(condition, actions, BatchNoise(generator), windows.action_is_pad)
+        loss = policy(condition, actions, BatchNoise(generator), windows.action_is_pad)["loss"]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

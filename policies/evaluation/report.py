@@ -67,8 +67,17 @@ def film_trials(
 
 
 def _chosen(specs: Sequence[EpisodeSpec], trials: Sequence[Trial]) -> dict[str, EpisodeSpec]:
-    """Return worst, best and median episode, as far as there are as many."""
-    ranked = [specs[i] for i in worst_first(trials) if trials[i].failure != REFUSED]
+    """Return worst, best and median episode, as far as there are as many.
+
+    They are ranked by progress, then by distance from the goal or force.
+    """
+
+    def worth(ended: tuple[Trial, EpisodeSpec]) -> tuple[float, ...]:
+        t = ended[0]
+        return t.success, t.progress, -(t.goal_distance or 0.0), -t.peak_force
+
+    acted = [pair for pair in zip(trials, specs, strict=True) if pair[0].failure != REFUSED]
+    ranked = [spec for _, spec in sorted(acted, key=worth)]
     if not ranked:
         return {}
     chosen = {"worst": ranked[0], "best": ranked[-1], "median": ranked[len(ranked) // 2]}
@@ -120,10 +129,6 @@ def table(trials: Sequence[Trial]) -> str:
             f"objects of {1e3 * min(masses):.0f} to {1e3 * max(masses):.0f} g, gripped with "
             f"{min(forces):.1f} to {max(forces):.1f} N"
         )
-    for success, what in ((True, "successes"), (False, "failures")):
-        if told := Counter(t.judged for t in trials if t.judged and t.success is success):
-            verdicts = ", ".join(f"{n} {verdict}" for verdict, n in told.items())
-            lines.append(f"the judge says of the {told.total()} {what}: {verdicts}")
     failures = Counter(t.failure for t in trials if t.failure)
     lines.append("failures: " + (", ".join(f"{k} {n}" for k, n in failures.items()) or "none"))
     if (clamped := np.mean([t.clamped for t in trials])) > _MUCH_CLAMPED:
@@ -139,19 +144,6 @@ def table(trials: Sequence[Trial]) -> str:
 def group_of(trial: Trial) -> str:
     """Return the family of the trial's wire, or the shape of its object."""
     return str(trial.episode.get("family") or trial.episode["shape"])
-
-
-def worst_first(trials: Sequence[Trial]) -> list[int]:
-    """Return indices of the trials, ranked by progress, then by distance from the goal or force."""
-    return sorted(
-        range(len(trials)),
-        key=lambda i: (
-            trials[i].success,
-            trials[i].progress,
-            -(trials[i].goal_distance or 0.0),
-            -trials[i].peak_force,
-        ),
-    )
 
 
 def _row(group: str, some: list[Trial], placed: bool) -> str:

@@ -111,7 +111,7 @@ class Diffusion(nn.Module):
         chunk: Float[Tensor, "b h a"],
         condition: Float[Tensor, "b c"],
         noise: BatchNoise,
-        is_pad: Bool[Tensor, "b h"] | None = None,
+        is_pad: Bool[Tensor, "b h"],
     ) -> Float[Tensor, ""]:
         """Return the mean error at random steps, without padded ticks."""
         sampler = self.config.sampler
@@ -147,7 +147,7 @@ class Regression(nn.Module):
         chunk: Float[Tensor, "b h a"],
         condition: Float[Tensor, "b c"],
         noise: BatchNoise,
-        is_pad: Bool[Tensor, "b h"] | None = None,
+        is_pad: Bool[Tensor, "b h"],
     ) -> Float[Tensor, ""]:
         """Return the mean absolute error without padded ticks; nothing is random."""
         return masked_mean((self.sample(condition) - chunk).abs(), is_pad)
@@ -159,12 +159,8 @@ class Regression(nn.Module):
         return self.network(condition).unflatten(1, self._shape)
 
 
-def masked_mean(
-    error: Float[Tensor, "b h a"], is_pad: Bool[Tensor, "b h"] | None
-) -> Float[Tensor, ""]:
+def masked_mean(error: Float[Tensor, "b h a"], is_pad: Bool[Tensor, "b h"]) -> Float[Tensor, ""]:
     """Return the mean over the ticks of all processes that are not padding; 0 if all are."""
-    if is_pad is None:
-        return error.mean()
     valid = ~is_pad[..., None]
     # Each process sums over its own rows, so all must divide by the same count.
     count = gather_batch(valid.sum()[None]).float().mean()

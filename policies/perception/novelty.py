@@ -40,7 +40,8 @@ class NoveltyDetector(nn.Module):
         _, axes = torch.linalg.eigh(((learned - self.mean) / self.scale).T.cov())
         self.components.copy_(axes[:, -self.components.shape[1] :])
         if len(others) >= _LEAST:
-            worst = torch.stack([_lasting(self._distance(e), ticks) for e in others]).sort().values
+            found = [self._distance(e).unfold(0, min(ticks, len(e)), 1) for e in others]
+            worst = torch.stack([lasting.amin(1).amax() for lasting in found]).sort().values
             self.limit.copy_(worst[math.ceil((len(worst) + 1) * (1 - _FALSE_ALARMS)) - 1])
 
     def forward(self, embedded: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
@@ -50,8 +51,3 @@ class NoveltyDetector(nn.Module):
     def _distance(self, embedded: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         scaled = (embedded - self.mean) / self.scale
         return (scaled - scaled @ self.components @ self.components.T).norm(dim=1)
-
-
-def _lasting(distance: Float[Tensor, " t"], ticks: int) -> Float[Tensor, ""]:
-    """Return the largest distance that `ticks` in a row reach."""
-    return distance.unfold(0, min(ticks, len(distance)), 1).amin(1).amax()

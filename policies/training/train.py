@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from accelerate.utils import send_to_device
 from jaxtyping import Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 
 from touchgoal.encoders.training.batch_noise import BatchNoise
@@ -18,15 +18,13 @@ from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 from touchgoal.policies import checkpoint
 from touchgoal.policies.config import TrainConfig
-from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
+from touchgoal.policies.network import PolicyConfig, PolicyNetwork
 from touchgoal.policies.training.end import fit_end
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
 BETAS, WEIGHT_DECAY = (0.95, 0.999), 1e-6  # of AdamW, as in diffusion_policy
 _WARMUP_STEPS = 500  # as there; a tenth of a training that is shorter
-_SEEN = "touch", "state", "images", "maps"  # of a batch, by the policy as it acts
-_LEARNED = "actions", "noise", "action_is_pad", "key_pose"  # and by the loss alone
 _VALIDATION_WINDOWS = 1024  # evenly spaced, for the losses
 
 
@@ -63,14 +61,14 @@ def train(
             folders.append(out_dir / SNAPSHOTS / f"epoch-{len(history):04d}")
         if folders and averaged.key_pose:
             batch = _validation_batch(averaged, validation)
-            averaged.key_pose.calibrate(*averaged.seen(_observed(batch)), batch["key_pose"][:, 1:])
+            averaged.key_pose.calibrate(*averaged.seen(batch["batch"]), batch["key_pose"][:, 1:])
         if folders and averaged.end:  # how many validation episodes it ends, of how many
             known["ended"] = fit_end(averaged, windows, validation, options.seed)
         for folder in folders:
             on_first_process(partial(checkpoint.save, averaged, folder, provenance | known))
 
     training = Training(
-        loss=PolicyLoss(network),
+        loss=network,
         n_samples=len(windows),
         batch=lambda rows, noise: make_batch(windows, windows.draw(rows, noise)) | {"noise": noise},
         optimizer=OptimizerConfig(
@@ -124,27 +122,11 @@ def _update_average(average: Sequence[Tensor], weights: Sequence[Tensor], n_aver
         mean.lerp_(weight, 1 - ema_decay(int(n_averaged)))
 
 
-class PolicyLoss(nn.Module):
-    """Training loss of a policy on what `make_batch` returns, with the `BatchNoise` as "noise"."""
-
-    def __init__(self, policy: PolicyNetwork) -> None:
-        super().__init__()
-        self.policy = policy
-
-    def forward(self, **batch: Any) -> dict[str, Tensor]:
-        """Return "loss"."""
-        observed = _observed(batch)
-        return {"loss": self.policy.loss(observed, **{name: batch[name] for name in _LEARNED})}
-
-
 def make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, Any]:
-    """Return some windows as `PolicyLoss` takes them, but for the noise."""
+    """Return some windows as a `PolicyNetwork` takes them in training, but for the noise."""
     observed, actions = windows.take(rows)
     return {
-        "touch": observed.touch,
-        "state": observed.state,
-        "images": observed.images,
-        "maps": observed.maps,
+        "batch": observed,
         "actions": actions,
         "action_is_pad": windows.action_is_pad[rows],
         "key_pose": windows.key_pose(rows),
@@ -159,21 +141,17 @@ def _validation_batch(policy: PolicyNetwork, windows: SequenceDataset) -> dict[s
     return cast(dict[str, Any], send_to_device(make_batch(windows, rows), device))
 
 
-def _observed(batch: dict[str, Any]) -> ObservationBatch:
-    return ObservationBatch(**{name: batch[name] for name in _SEEN})
-
-
 @torch.no_grad()
 def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dict[str, float]:
     """Return the loss, the error of the joint change (rad) planned over the chunk, and of key poses (m)."""
     batch = _validation_batch(policy, windows)
     generator = torch.Generator().manual_seed(seed)
-    observed = _observed(batch)
+    observed = batch["batch"]
     planned = policy.plan(observed, generator, key_pose=batch["key_pose"]).actions
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
     error = off.sum(1).norm(dim=1).mean()
-    loss = PolicyLoss(policy)(**batch, noise=BatchNoise(generator))["loss"]
+    loss = policy(**batch, noise=BatchNoise(generator))["loss"]
     metrics = {"validation_loss": loss.item(), "validation_error": error.item()}
     if policy.key_pose:
         off = policy.key_pose.error(*policy.seen(observed), batch["key_pose"][:, 1:])

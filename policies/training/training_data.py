@@ -115,7 +115,7 @@ def find_task(chosen: Sequence[tuple[EpisodeSet, Sequence[int]]], task: str | No
 
     UserError: they are of several tasks or of another one, or name none and `task` is None.
     """
-    root, found = chosen[0][0].root, _common("task", chosen)
+    root, found = chosen[0][0].root, common_fact("task", chosen)
     if task and found not in ("", task):
         raise UserError(f"{root} is of {found}, not of {task}: leave out --task")
     if not (found or task):
@@ -139,12 +139,8 @@ def succeeded(meta: Mapping[str, Any]) -> bool | None:
     return bool(meta["success"])
 
 
-def common_sensor(sets: Sequence[tuple[EpisodeSet, Sequence[int]]]) -> str:
-    """Return the fingertip sensor of the episodes, "" if none is named; UserError if several."""
-    return _common("sensor", sets)
-
-
-def _common(what: str, sets: Sequence[tuple[EpisodeSet, Sequence[int]]]) -> str:
+def common_fact(what: str, sets: Sequence[tuple[EpisodeSet, Sequence[int]]]) -> str:
+    """Return the task or sensor of the episodes, "" if none is named; UserError if several."""
     found = {str(s.meta(i).get(what, "")): s.root for s, rows in sets for i in rows}
     if len(found) > 1:
         kinds = "; ".join(f"{name or 'unknown'} in {root}" for name, root in found.items())

@@ -23,20 +23,13 @@ _LISTED = "source object outcome goal own_goal unit contact contact_source fps m
 
 def write_report(
     curves: Curves, folder: Path, name: str, with_plot: bool = True, about: str = ""
-) -> dict[str, Path]:
-    """Write NAME.csv and, on request, NAME.png, each atomically; return the paths by kind.
-
-    The plot's title ends with `about`.
-    """
-    contents = {"csv": curves_csv(curves).encode()}
+) -> None:
+    """Write NAME.csv and, on request, NAME.png, each atomically; the plot's title ends with `about`."""
+    write_file(folder / f"{name}.csv", curves_csv(curves).encode())
     if with_plot:
         png = io.BytesIO()
         FigureCanvasAgg(plot(curves, about=about)).print_png(png, metadata={"Software": None})
-        contents["png"] = png.getvalue()
-    paths = {kind: folder / f"{name}.{kind}" for kind in contents}
-    for kind, path in paths.items():
-        write_file(path, contents[kind])
-    return paths
+        write_file(folder / f"{name}.png", png.getvalue())
 
 
 def report_all(records: Sequence[Path], out: Path, provenance: Mapping[str, Any]) -> str:

@@ -27,7 +27,7 @@ from touchgoal.episodes.store import EpisodeSet  # noqa: E402
 from touchgoal.policies.acting import LearnedPolicy  # noqa: E402
 from touchgoal.policies.checkpoint import SavedPolicy  # noqa: E402
 from touchgoal.policies.training import sequence_dataset as data  # noqa: E402
-from touchgoal.policies.training.train import PolicyLoss, make_batch  # noqa: E402
+from touchgoal.policies.training.train import make_batch  # noqa: E402
 
 ROOT = HERE.parents[1]
 TWIN = ["--lock-step", "--env.objects", "wooden_block", "--env.cameras", "front"]
@@ -60,7 +60,7 @@ def train_with_lerobot(python: Path, plugins: Path, folder: Path) -> None:
     batch = make_batch(data.SequenceDataset(recorded, actor.config), torch.tensor(rows))
     network = SavedPolicy(actor.directory).network()
     torch.manual_seed(0)
-    own = PolicyLoss(network)(**batch, noise=BatchNoise(torch.default_generator))["loss"].item()
+    own = network(**batch, noise=BatchNoise(torch.default_generator))["loss"].item()
     print(f"loss of {len(rows)} windows by lerobot-train {theirs:.7f}, by touchgoal {own:.7f}")
     assert abs(own - theirs) < 1e-5 * own
     trained = touchgoal.load_policy(out / "checkpoints" / "last" / "pretrained_model")
