@@ -3,6 +3,7 @@
 import os
 import shlex
 from dataclasses import is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -35,6 +36,9 @@ class Config:
     """Processes that simulate."""
     ray: str | None = None
     """Address of a Ray cluster whose cores work in place of --workers; auto: one started on this machine."""
+    judge: str | None = None
+    """Folder of fit-normalizer --judge, or gelsight_mini for the one that ships: its judge ends episodes
+    and judges them beside the simulator, after a second of rest."""
     video: bool = True
     """Film the worst, the median and the best episode."""
     env: TaskConfig = ENVS["pick-place"]
@@ -50,9 +54,15 @@ def main(config: Config) -> None:
     from touchgoal.runtime.run_folder import open_run
 
     policy, env = prepare_policy(config.policy, config.env, config.target)
+    judge = None
+    if config.judge is not None:
+        from touchgoal.rewards.reward_wrapper import RunJudge
+
+        judge = partial(RunJudge, config.judge)
+        env = replace(env, rest=1.0, tactile=True, cameras=config.env.cameras)
     specs = trial_specs(env, config.episodes, config.seed)
     out = open_run(config.out, "run-policy", replace(config, env=env))
-    trials = run_trials(env, policy, specs, config.ray or config.workers)
+    trials = run_trials(env, policy, specs, config.ray or config.workers, judge)
     trials = record_trials(out, trials, len(specs))
     if config.video:
         film_trials(out, env, specs, trials, policy, config.workers)

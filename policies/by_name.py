@@ -23,7 +23,8 @@ def prepare_policy(
 ) -> tuple[Callable[[Any], Actor], TaskConfig]:
     """Return what makes a policy for an episode, and the task's options with the images it reads.
 
-    The first takes an environment after its reset, and pickles.
+    The first takes an environment after its reset, and pickles. Cameras that `task` asks for are observed
+    beside those that the policy reads.
 
     UserError: no such policy, it cannot act in the task, an option of the task is set to
     something else than the policy needs, or it takes no target.
@@ -36,6 +37,8 @@ def prepare_policy(
     if isinstance(make, SavedPolicy):
         _warn_without_target(make, task)
     default = type(task)()
+    if task.cameras != default.cameras and {*needed.cameras} <= {*task.cameras}:
+        needed = replace(needed, cameras=task.cameras)  # such as those that a judge looks through
     for name in (field.name for field in fields(task)):
         given, runs = getattr(task, name), getattr(needed, name)
         unread = name == "camera_size" and not needed.cameras

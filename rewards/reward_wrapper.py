@@ -1,5 +1,7 @@
-"""The cost to a goal as the reward of a Gymnasium environment."""
+"""The cost to a goal as the reward of a Gymnasium environment, and the judge of its episodes."""
 
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -64,3 +66,30 @@ class RewardWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray
         reading = self._meter.measure()
         assert reading is not None  # of the observation just added
         return reading.cost
+
+
+class RunJudge:
+    """Judge of one episode of an environment, as `deploy` asks it: once a second, and at the end."""
+
+    def __init__(self, judge: str | Path, env: gym.Env) -> None:
+        """Take a judge, see `Reward.of_judge`, and an environment of touchgoal after its reset.
+
+        UserError: no judge lies there, or it cannot judge such observations.
+        """
+        reward = _judged_reward(judge).prepare(inputs_of(env))
+        about, self._rate = env.unwrapped.episode_info(), env.unwrapped.config.control_hz  # pyright: ignore[reportAttributeAccessIssue]
+        self._meter = CostMeter(reward, str(about.get("object", "")), self._rate, judges=True)
+
+    def ended(self, tick: Observation) -> bool:
+        """Take the next tick; return whether the judge says lastingly that the task is done."""
+        self._meter.add(tick)
+        reading = self._meter.measure() if len(self._meter.waiting) >= self._rate else None
+        return reading is not None and reading.done
+
+    def verdict(self) -> str:
+        """Return the verdict on the newest tick as the episode's end."""
+        self._meter.measure()
+        return self._meter.judge().verdict
+
+
+_judged_reward = cache(Reward.of_judge)  # encoders are loaded once a process

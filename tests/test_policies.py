@@ -207,6 +207,8 @@ def test_what_comes_next_has_the_options_of_the_task() -> None:
 def test_an_option_that_a_policy_fixes_is_kept(policy: str, options: dict, message: str) -> None:
     with pytest.raises(UserError, match=message):
         prepare_policy(policy, PickPlaceConfig(**options))
+    maze = BeadMazeConfig(cameras=("front",))  # which a judge may read
+    assert prepare_policy("shipped", maze)[1].cameras == ("front",)
 
 
 def test_a_target_is_told_to_what_takes_one(capsys: pytest.CaptureFixture[str]) -> None:
@@ -343,6 +345,28 @@ def test_only_what_is_known_to_be_good_is_learned_from(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="more than one task"):
         find_task([(episodes, [0]), (arm, [0])], None)
     assert common_fact("sensor", [(arm, [0])]) == "digit"
+
+
+class SecondTickJudge:
+    """Says success lastingly at the second tick."""
+
+    def __init__(self, env: object) -> None:
+        self.ticks = 0
+
+    def ended(self, tick: dict) -> bool:
+        self.ticks += 1
+        return self.ticks == 2
+
+    def verdict(self) -> str:
+        return "success"
+
+
+def test_a_judge_ends_an_episode_beside_the_simulator() -> None:
+    specs = trial_specs(BLIND_ENV, 1, 5)
+    trials = list(run_trials(BLIND_ENV, PickPlaceExpert, specs, 1, SecondTickJudge))
+    assert (trials[0].judged, trials[0].success) == ("success", False)
+    assert trials[0].seconds == pytest.approx(1 / BLIND_ENV.control_hz)
+    assert "the judge says of the 1 failures: 1 success" in table(trials)
 
 
 def test_the_films_show_the_trials(tmp_path: Path) -> None:

@@ -48,6 +48,7 @@ class Trial:
         clamped: share of the ticks whose action was beyond the arm's or the gripper's limits.
         light_change: largest change of a fingertip's light since the first image, as a share.
         episode: what distinguishes it, such as the object, its mass, or the wire.
+        judged: verdict of a judge; "" without one.
         late: s from the first success to the policy's word that it is done; None without both.
     """
 
@@ -63,6 +64,7 @@ class Trial:
     clamped: float
     light_change: float
     episode: dict[str, Any]
+    judged: str = ""
     late: float | None = None
 
 
@@ -134,26 +136,34 @@ def run_trials(
     policy: Callable[[Any], Actor],
     specs: Sequence[EpisodeSpec],
     workers: Workers,
+    judge: Callable[[Any], Any] | None = None,
 ) -> Iterator[Trial]:
     """Run a policy in each episode; yield the trials in order as they end.
 
-    With one worker all runs in this process; for several `policy` must pickle.
+    With one worker all runs in this process; for several `policy` and `judge` (as `RunJudge`), which make
+    one for an environment, must pickle.
     """
     if workers == 1:
         for spec in track(specs, "trials", "episode"):
-            yield run_trial(config, policy, spec)
+            yield run_trial(config, policy, spec, judge)
         return
-    with parallel_map(partial(run_trial, config, policy), specs, workers) as trials:
+    with parallel_map(partial(run_trial, config, policy, judge=judge), specs, workers) as trials:
         yield from track(trials, "trials", "episode", total=len(specs))
 
 
-def run_trial(config: TaskConfig, policy: Callable[[Any], Actor], spec: EpisodeSpec) -> Trial:
-    """Run one episode."""
+def run_trial(
+    config: TaskConfig,
+    policy: Callable[[Any], Actor],
+    spec: EpisodeSpec,
+    judge: Callable[[Any], Any] | None = None,
+) -> Trial:
+    """Run one episode; a judge's success ends it, too."""
     env = make_env(config)
     try:
         observation, info = env.reset(seed=spec.seed, options=spec.options)
         keys = (ft.WRENCH, ft.TRUTH_PAD_WRENCH, ft.TRUTH_PROGRESS, ft.ACTION, ft.TRUTH_SUCCESS)
         rows, light, failed, late = [], LightWatch(), [], None
+        judging = judge(env) if judge else None
         last = {**observation, ft.ACTION: np.zeros(env.action_space.shape or ()), **info}
         try:
             actor = policy(env)
@@ -161,6 +171,8 @@ def run_trial(config: TaskConfig, policy: Callable[[Any], Actor], spec: EpisodeS
                 if len(rows) % _LIGHT_TICKS == 0:
                     light.update(last)
                 rows.append([last[key] for key in keys])  # images would fill the memory
+                if judging and judging.ended(last):
+                    break
             failed = [GAVE_UP] * bool(actor.given_up) + [FALSELY_DONE] * actor.done
             if actor.done and any(right := [bool(row[-1][0]) for row in rows]):
                 since_first = (len(rows) - 1 - right.index(True)) / config.control_hz
@@ -187,6 +199,7 @@ def run_trial(config: TaskConfig, policy: Callable[[Any], Actor], spec: EpisodeS
             / max(len(rows) - 1, 1),
             light_change=light.change,
             episode=env.episode_info(),
+            judged=judging.verdict() if judging else "",
             late=late,
         )
     finally:

@@ -129,6 +129,10 @@ def table(trials: Sequence[Trial]) -> str:
             f"objects of {1e3 * min(masses):.0f} to {1e3 * max(masses):.0f} g, gripped with "
             f"{min(forces):.1f} to {max(forces):.1f} N"
         )
+    for success, what in ((True, "successes"), (False, "failures")):
+        if told := Counter(t.judged for t in trials if t.judged and t.success is success):
+            verdicts = ", ".join(f"{n} {verdict}" for verdict, n in told.items())
+            lines.append(f"the judge says of the {told.total()} {what}: {verdicts}")
     failures = Counter(t.failure for t in trials if t.failure)
     lines.append("failures: " + (", ".join(f"{k} {n}" for k, n in failures.items()) or "none"))
     if (clamped := np.mean([t.clamped for t in trials])) > _MUCH_CLAMPED:
