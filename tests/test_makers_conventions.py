@@ -136,7 +136,7 @@ def test_drivers_say_what_is_done_to_the_robot(name: str, request: pytest.Fixtur
     twin: RunningTwin = request.getfixturevalue(name)
     twin.begin("reset 3")
     safety = replace(twin.cell.safety, state_timeout=1.0)
-    with closing(connect_arm(replace(twin.cell, lock_step=False, safety=safety), 20.0)) as arm:
+    with closing(connect_arm(replace(twin.cell, lock_step=False, safety=safety))) as arm:
         before = arm.read()
         twin.ask("nudge {} {} {} 600".format(*PUSH))
         twin_time = twin.ask("truth")["time"]
