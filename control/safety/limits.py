@@ -97,7 +97,7 @@ _LEVER = 0.6  # m: farthest that a hand over the table is from the axis of a joi
 
 @dataclass(frozen=True)
 class TaskForces:
-    """Peaks over a task's successful demonstrations (their number: `episodes`), seeds from 30000.
+    """Peaks over a task's successful demonstrations, seeds from 30000.
 
     `force` is on the hand, N; `indentation` in a gel, m, as `control.tactile.indentation` measures
     it.
@@ -105,7 +105,6 @@ class TaskForces:
 
     force: float
     indentation: float
-    episodes: int
 
     @property
     def force_ceiling(self) -> float:
@@ -126,8 +125,8 @@ class TaskForces:
 # 60 episodes of pick-place, and 60 with --feedback; 29 of the maze with a disturbance of 4 mm/s for
 # the force, and six without for the indentation.
 TASK_FORCES: dict[str, TaskForces] = {
-    "pick-place": TaskForces(force=16.5, indentation=2.1e-3, episodes=120),
-    "bead-maze": TaskForces(force=17.9, indentation=1.15e-3, episodes=29),
+    "pick-place": TaskForces(force=16.5, indentation=2.1e-3),
+    "bead-maze": TaskForces(force=17.9, indentation=1.15e-3),
 }
 
 
