@@ -10,7 +10,6 @@ from touchgoal.control import features as ft
 from touchgoal.control.arrays import Image
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.interfaces import ArmReading, DriverError, Frame, GripperReading
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.fingertip_health import FingertipHealth
 from touchgoal.control.tactile.indentation import IndentationMeter
@@ -50,7 +49,7 @@ class ObservationReader:
                     f"{camera_size[1]} are needed: make them larger where the camera is set"
                 )
         robot = connection.robot
-        self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
+        self._kinematics = robot.kinematics()
         tips = connection.fingertips
         self._health = {key: FingertipHealth(tip.model) for key, tip in tips.items()}
         for key, tip in tips.items():

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM, ArmModel, JointLimits
+from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import Vector3
 from touchgoal.control.motion.tool import FRANKA_HAND, ROBOTIQ_2F85, Tool
 
@@ -50,6 +51,10 @@ class RobotLimits:
     force: float = 15.0
     torque: float = 10.0
     indentation: float = 1.5e-3  # m of depth in a gel that stops the arm (`tactile.indentation`)
+
+    def kinematics(self) -> Kinematics:
+        """Return the kinematics of the arm with this tool."""
+        return Kinematics(self.arm, self.tool.tcp_offset)
 
     @property
     def hardware(self) -> JointLimits:

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.teleoperation.device import TeleoperationConfig, TeleoperationDevice
@@ -63,7 +62,7 @@ class Teleoperator(Actor):
     ) -> None:
         """Begin at rest; `commanded` returns the joints (rad) commanded now."""
         self._device, self._commanded, self._config = device, commanded, config
-        self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
+        self._kinematics = safety.limits.kinematics()
         self._widths = {"close": safety.limits.tool.stroke[0], "open": safety.limits.tool.stroke[1]}
         self._compliance = Compliance(1, _FREE_TORQUE)
         self._dt = safety.dt
@@ -103,7 +102,7 @@ class YieldingHand(Compliance):
     def __init__(self, safety: ActionFilter, commanded: Callable[[], np.ndarray]) -> None:
         """Get ready; `commanded` returns the joints (rad) commanded now."""
         self._commanded, self._dt = commanded, safety.dt
-        self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
+        self._kinematics = safety.limits.kinematics()
         super().__init__(_MORE, _UNCORRECTED_TORQUE)
 
     def add_to(
