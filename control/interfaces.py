@@ -89,7 +89,8 @@ class Arm(Protocol):
     """A position-controlled arm.
 
     `command` takes joint positions (rad) to be reached one control period from now. Without a new
-    one the arm comes to rest at the last. After `stop` or a fault it refuses commands.
+    one the arm comes to rest at the last. After `stop` or a fault it refuses commands; only a new
+    connection ends that.
     """
 
     def read(self) -> ArmReading:
@@ -101,9 +102,6 @@ class Arm(Protocol):
 
     def stop(self) -> None:
         """Brake as fast as the limits allow, and stay; returns at once."""
-
-    def recover(self) -> None:
-        """Clear `stop` or a fault. Call it only when a person asked for it."""
 
     def close(self) -> None:
         """Bring the arm to rest, then disconnect."""

@@ -55,10 +55,9 @@ def main(config: Config) -> None:
 
 
 def _recover(cell: CellConfig) -> None:
-    from touchgoal.control import features as ft
     from touchgoal.control.cell.connection import connect_arm
 
-    with closing(connect_arm(cell, ft.CONTROL_HZ, recover=True)) as arm:
+    with closing(connect_arm(cell, recover=True)) as arm:
         if fault := arm.read().fault:
             raise UserError(f"not recovered: {fault}")
     print("recovered: the arm takes commands")

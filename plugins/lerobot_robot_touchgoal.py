@@ -87,7 +87,7 @@ class TouchgoalRobot(Robot):
         """Ask the operator, connect and run `deploy`'s checks; UserError or DriverError if one fails."""
         if not self._yes:
             confirm(self._cell)
-        connection = connect_cell(self._cell, ft.CONTROL_HZ)
+        connection = connect_cell(self._cell)
         try:
             with TemporaryDirectory(dir=".") as nowhere:  # lerobot records by itself
                 safety = check_cell(self._cell, connection, Path(nowhere))

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from touchgoal.control.features import N_JOINTS
-from touchgoal.control.motion.kinematics import DAMPING, Fr3Kinematics
+from touchgoal.control.motion.kinematics import DAMPING, Kinematics
+from touchgoal.control.safety.limits import FR3
 from touchgoal.policies.config import ActionRepresentation
 
 ACTION_DIM = N_JOINTS + 1
@@ -87,8 +88,8 @@ def _damped_pseudoinverse(J: Float[Tensor, "b 6 7"]) -> Float[Tensor, "b 7 6"]:
 
 
 @cache
-def _kinematics() -> Fr3Kinematics:
-    return Fr3Kinematics()
+def _kinematics() -> Kinematics:
+    return FR3.kinematics()
 
 
 class Normalizer(nn.Module):

@@ -5,7 +5,6 @@ import mujoco
 import numpy as np
 
 from touchgoal.control.hand_eye.board import Board
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix
 from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.scene.build import arm_joints, build
@@ -83,7 +82,7 @@ class BoardScene:
 
 def postures(scene: BoardScene, n: int, seed: int) -> list[np.ndarray]:
     """Postures (rad) that show most of the board: places 0.2 m apart, tilted by up to 35 degrees."""
-    kinematics, rng = Kinematics(FR3.arm, FR3.tool.tcp_offset), np.random.default_rng(seed)
+    kinematics, rng = FR3.kinematics(), np.random.default_rng(seed)
     middle = np.array([0.40, 0.0, 0.25] if scene.on_hand else [0.55, 0.0, 0.32])
     found: list[np.ndarray] = []
     while len(found) < n:

@@ -67,8 +67,6 @@ class FakeArm:
     def stop(self) -> None:
         self.stopped = True
 
-    def recover(self) -> None: ...
-
     def close(self) -> None: ...
 
 

@@ -151,7 +151,7 @@ def test_what_was_opened_is_closed_if_a_device_does_not_open(
     monkeypatch.setattr(connection, "connect_arm", MagicMock(side_effect=kind("it broke")))
     cell = replace(read_cell_file(find_cell_file(Path("fr3_two_minis"))), load_cell=None)
     with pytest.raises(UserError, match="^arm: .*it broke$"):
-        connection.connect_cell(cell, ft.CONTROL_HZ)
+        connection.connect_cell(cell)
     assert closed == ["gripper", "tactile_right", "tactile_left", "front"]
     assert "did not close: division by zero" in capsys.readouterr().err
 

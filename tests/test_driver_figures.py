@@ -35,7 +35,7 @@ from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 
 Patch = pytest.MonkeyPatch
 HOME, E = FR3.arm.home, np.eye(7)
-UR_CONFIG = ArmConfig("", UR5E, 20.0, 125.0, 0.05)
+UR_CONFIG = ArmConfig("", UR5E, 125.0, 0.05)
 
 
 class Wall:
@@ -81,7 +81,7 @@ class Client(ArmClient):
 
 @pytest.fixture
 def client(wall: Wall) -> Client:
-    return Client(ArmConfig("", FR3, 20.0, 200.0, 0.5), False)
+    return Client(ArmConfig("", FR3, 200.0, 0.5), False)
 
 
 def test_a_late_tick_makes_up_for_four_periods(client: Client) -> None:
@@ -130,12 +130,12 @@ def test_targets_are_taken_inside_the_range_and_until_a_stop(client: Client) -> 
 def test_each_arm_is_driven_at_its_rate(monkeypatch: Patch) -> None:
     monkeypatch.setattr(streaming, "DriverProcess", made := MagicMock())
     for name, rate, timeout in (("fr3_two_minis", 200.0, 0.5), ("ur5e", 125.0, 0.05)):
-        connection.connect_arm(read_cell_file(EXAMPLES / f"{name}.toml"), 20.0)
+        connection.connect_arm(read_cell_file(EXAMPLES / f"{name}.toml"))
         config = made.call_args.args[1]
-        assert (config.rate, config.state_timeout, config.hz) == (rate, timeout, 20.0)
-        assert made.call_args.kwargs == {"connect_timeout": 30.0, "call_timeout": 1.5}
+        assert (config.rate, config.state_timeout) == (rate, timeout)
+        assert made.call_args.kwargs == {"call_timeout": 1.5}
     still = replace(read_cell_file(EXAMPLES / "fr3_two_minis.toml"), lock_step=True)
-    connection.connect_arm(still, 20.0)  # nothing moves while a twin in lock-step is late
+    connection.connect_arm(still)  # nothing moves while a twin in lock-step is late
     assert made.call_args.kwargs["call_timeout"] == 60.0
 
 
@@ -159,7 +159,7 @@ def test_what_the_franka_is_told(monkeypatch: Patch) -> None:
         limit = getattr(robot, f"joint_{name}_limit")
         limit.max, limit.get = np.full(7, 1e4), lambda n=name: set_[n]
         limit.set = lambda value, n=name: set_.update({n: value})
-    client = franka.FrankaClient(ArmConfig("", FR3, 20.0, 200.0, 0.5), False)
+    client = franka.FrankaClient(ArmConfig("", FR3, 200.0, 0.5), False)
     told = library.Robot.call_args.kwargs
     assert (told["default_torque_threshold"], told["default_force_threshold"]) == (20.0, 30.0)
     assert set_["velocity"] == pytest.approx([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])
@@ -198,7 +198,7 @@ def rtde(monkeypatch: Patch) -> SimpleNamespace:
 
 @pytest.mark.parametrize(("rate", "lookahead"), [(125.0, 0.03), (20.0, 0.1), (5.0, 0.2)])
 def test_what_the_ur_is_told(rtde: SimpleNamespace, rate: float, lookahead: float) -> None:
-    client, q = ur.UrClient(ArmConfig("", UR5E, 20.0, rate, 0.05), False), np.zeros(6)
+    client, q = ur.UrClient(ArmConfig("", UR5E, rate, 0.05), False), np.zeros(6)
     rtde.control.setWatchdog.assert_called_with(10.0)
     client._send(q, q)
     expected = pytest.approx([1 / rate, lookahead, 300.0])
@@ -386,7 +386,7 @@ def test_a_fingertips_proportions_are_right_within_3_percent(value: int, beyond:
 def test_no_controller_is_said(client: type) -> None:
     robot = FR3 if client is franka.FrankaClient else UR5E
     with pytest.raises(DriverError, match="FCI|verify the IP"):
-        ArmProcess(client, ArmConfig("127.99.99.99", robot, 20.0, 100.0, 0.5))
+        ArmProcess(client, ArmConfig("127.99.99.99", robot, 100.0, 0.5))
 
 
 def test_a_wrench_is_moved_with_its_lever() -> None:

@@ -166,4 +166,4 @@ def test_a_missing_client_library_is_said_in_a_line(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(UserError, match=f"{module} is missing: pip install"):
-        client(ArmConfig("127.0.0.1", FR3, 20.0, 100.0, 0.5), False)
+        client(ArmConfig("127.0.0.1", FR3, 100.0, 0.5), False)

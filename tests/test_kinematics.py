@@ -13,15 +13,14 @@ from fake_cell import SIM, FakeCell, write_cell_file
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.deployment.preflight import preflight
-from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM
-from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics
+from touchgoal.control.motion.arm_models import FR3_ARM
+from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
 from touchgoal.control.motion.self_collision import (
     SelfDistance,
     require_no_self_collision,
     segment_distance,
 )
-from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.motion.trajectories import joint_move
 from touchgoal.control.safety import limits as robots
 from touchgoal.control.safety.action_filter import ActionFilter
@@ -31,8 +30,8 @@ from touchgoal.sim_envs.scene.build import SceneConfig, build
 if TYPE_CHECKING:
     import mujoco
 
-UR5E = Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)
-BOTH_ARMS = pytest.mark.parametrize("arm", [Fr3Kinematics(), UR5E], ids=["FR3", "UR5e"])
+UR5E = robots.UR5E.kinematics()
+BOTH_ARMS = pytest.mark.parametrize("arm", [robots.FR3.kinematics(), UR5E], ids=["FR3", "UR5e"])
 POSES = 1000
 NEAR = 0.2  # rad, farthest that a joint is from the solution at the start
 _EDGE = 0.05  # rad from its limit in which a joint counts as near it
@@ -84,12 +83,12 @@ def test_fr3_matches_mujoco() -> None:
     spec.body("hand").quat = np.array([np.cos(np.pi / 8), 0, 0, -np.sin(np.pi / 8)])
     model = spec.compile()
     dofs = [int(model.joint(f"fr3_joint{i}").dofadr[0]) for i in range(1, 8)]
-    against_mujoco(model, Fr3Kinematics(), "tcp", dofs)
+    against_mujoco(model, robots.FR3.kinematics(), "tcp", dofs)
 
 
 def test_out_of_reach_is_said() -> None:
     with pytest.raises(UserError, match="cannot reach"):
-        Fr3Kinematics().solve_ik(np.array([1.5, 0, 0.2]), fingers_down(0), FR3_ARM.home)
+        robots.FR3.kinematics().solve_ik(np.array([1.5, 0, 0.2]), fingers_down(0), FR3_ARM.home)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.3, 2.0, np.pi - 1e-6, np.pi])
@@ -216,7 +215,7 @@ def test_segment_distance_is_the_least_over_all_points() -> None:
 
 
 def test_moves_over_the_table_are_free_and_one_into_the_arm_itself_is_not() -> None:
-    robot, arm, rng = robots.FR3, Fr3Kinematics(), np.random.default_rng(1)
+    robot, arm, rng = robots.FR3, robots.FR3.kinematics(), np.random.default_rng(1)
     distance, q = SelfDistance(FR3_ARM), FR3_ARM.home
     for _ in range(20):
         position = rng.uniform([0.38, -0.25, 0.02], [0.62, 0.25, 0.35])
@@ -242,7 +241,7 @@ def test_the_preflight_names_kinematics_that_differ_from_the_controllers(
     mm: float, told: str, tmp_path: Path
 ) -> None:
     cell = FakeCell()
-    tcp, _ = Fr3Kinematics().forward(cell.arm.reading.q)
+    tcp, _ = robots.FR3.kinematics().forward(cell.arm.reading.q)
     cell.arm.reading = replace(cell.arm.reading, tcp=tcp + 1e-3 * mm * np.array([0.6, 0.0, -0.8]))
     file, safety = write_cell_file(tmp_path, SIM), ActionFilter(robots.FR3, ft.CONTROL_HZ)
     lines = preflight(read_cell_file(file), cell.connection(), safety, tmp_path, lambda: 0)

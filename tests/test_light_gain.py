@@ -100,7 +100,7 @@ READERS: dict[str, Callable[[Frame, Frame], np.ndarray]] = {
     "depth": lambda frame, rest: 1e3 * DEPTH.estimate(frame, rest.astype(np.float32)),
     "indentation": followed_indentation,
     "unexplained share": lambda frame, rest: np.array(
-        [explain(DEPTH, MINI, frame, rest.astype(np.float32)).unexplained]
+        [explain(DEPTH, frame, rest.astype(np.float32)).unexplained]
     ),
     "ball": find_circle,
     "force": lambda frame, rest: change_statistics(frame, rest.astype(np.float32)),

@@ -38,7 +38,7 @@ def swing(
     cell: CellConfig, pause: float, pause_images: Callable[[float], None] | None = None
 ) -> list[np.ndarray]:
     """Return all readings of each tick while the arm swings and the hand closes."""
-    connection, seen = connect_cell(cell, ft.CONTROL_HZ), []
+    connection, seen = connect_cell(cell), []
     q = connection.arm.read().q
     for k in range(_TICKS):
         connection.arm.command(q + 0.1 * np.sin(k / 6))
@@ -93,7 +93,7 @@ def able_to_press(robot: RobotLimits) -> RobotLimits:
 
 
 def over_the_wire(cell: CellConfig, actions: list[np.ndarray]) -> list[ArmReading]:
-    connection = connect_cell(cell, ft.CONTROL_HZ)
+    connection = connect_cell(cell)
     robot, arm, seen = able_to_press(connection.robot), connection.arm, []
     safety, lag = ActionFilter(robot, ft.CONTROL_HZ), ServoLag(robot, 1 / ft.CONTROL_HZ)
     state = safety.start(arm.read().q)

@@ -34,7 +34,6 @@ from touchgoal.control.deployment.observation import ObservationReader
 from touchgoal.control.deployment.realtime import RealTimeActor
 from touchgoal.control.deployment.scripted import PickPlacePoses, PlannedMove, ScriptedActor
 from touchgoal.control.interfaces import ArmReading, Frame, GripperReading, LoadReading, Planner
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.trajectories import joint_move
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
@@ -43,7 +42,7 @@ from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 
 Patch = pytest.MonkeyPatch
 E, HOME, SAFETY = np.eye(7), FR3.arm.home, ActionFilter(FR3, 20)
-KINEMATICS = Kinematics(FR3.arm, FR3.tool.tcp_offset)
+KINEMATICS = FR3.kinematics()
 GEL = load(GELSIGHT_MINI.sensor_file).background
 QUIET = {"operator_request": lambda: "", "on_tick": lambda _: None}
 

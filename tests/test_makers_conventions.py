@@ -16,7 +16,6 @@ from running_twin import RunningTwin, client
 from touchgoal.control.arms import franka
 from touchgoal.control.cell.connection import connect_arm
 from touchgoal.control.cell.limits import cell_limits
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import UR5E
 from touchgoal.sim_envs.twin.franka.limits import estimate_sent
 
@@ -136,7 +135,7 @@ def test_drivers_say_what_is_done_to_the_robot(name: str, request: pytest.Fixtur
     twin: RunningTwin = request.getfixturevalue(name)
     twin.begin("reset 3")
     safety = replace(twin.cell.safety, state_timeout=1.0)
-    with closing(connect_arm(replace(twin.cell, lock_step=False, safety=safety), 20.0)) as arm:
+    with closing(connect_arm(replace(twin.cell, lock_step=False, safety=safety))) as arm:
         before = arm.read()
         twin.ask("nudge {} {} {} 600".format(*PUSH))
         twin_time = twin.ask("truth")["time"]
@@ -146,6 +145,6 @@ def test_drivers_say_what_is_done_to_the_robot(name: str, request: pytest.Fixtur
         twin.ask("nudge 0 0 0 0")
     np.testing.assert_allclose((pushed.wrench - before.wrench)[:3], PUSH, atol=0.5)
     robot = cell_limits(twin.cell)
-    nominal, _ = Kinematics(robot.arm, robot.tool.tcp_offset).forward(before.q)
+    nominal, _ = robot.kinematics().forward(before.q)
     assert before.tcp is not None
     np.testing.assert_allclose(before.tcp, nominal, atol=1e-4)

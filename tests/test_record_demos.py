@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.scripted import PickPlacePoses
 from touchgoal.control.interfaces import DriverError
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
@@ -132,7 +131,7 @@ class Pushed(TeleoperationDevice):
 def act(twist: list[float], wrench: tuple[float, ...] = (0.0,) * 6) -> tuple[np.ndarray, ...]:
     """What an action moves (m) and turns (rad, base frame), and the gripper's width."""
     config = record_demos.TeleoperationConfig(speed=0.1, turn_speed=0.4)
-    kinematics = Kinematics(FR3.arm, FR3.tool.tcp_offset)
+    kinematics = FR3.kinematics()
     q = FR3.arm.home
     hand = Teleoperator(Pushed(twist), ActionFilter(FR3, HZ), lambda: q, config)
     first = {ft.WRENCH: np.full(6, 1.0, np.float32), ft.STATE: np.full(15, 0.05, np.float32)}
@@ -158,7 +157,7 @@ def test_the_hand_moves_as_asked_and_yields_to_what_it_presses_on() -> None:
 
 
 def test_a_policy_of_ones_own_task_yields_as_a_led_hand_does() -> None:
-    kinematics, q = Kinematics(FR3.arm, FR3.tool.tcp_offset), FR3.arm.home
+    kinematics, q = FR3.kinematics(), FR3.arm.home
     hand, still = YieldingHand(ActionFilter(FR3, HZ), lambda: q), np.append(np.zeros(7), 0.05)
     hand.start({ft.WRENCH: np.ones(6)})
     light = {ft.WRENCH: 1.0 + np.array([0, 0, 2.9, 0, 0, 0.5])}

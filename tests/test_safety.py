@@ -13,7 +13,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety import limits as robots
 from touchgoal.control.safety.action_filter import (
     ActionFilter,
@@ -111,7 +110,7 @@ def test_eight_corners_of_the_fingertips_stay_5_mm_above_the_table(robot: RobotL
     layer = LAYERS[robot.arm.name]
     points = layer.monitored_points(robot.arm.home[None])[0]
     assert len(points) == 1 + 8 and robot.fingertips.lower[2] == 0.005
-    kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
+    kinematics = robot.kinematics()
     position, R = kinematics.forward(robot.arm.home)
     case = np.array([0.0145, 0.0285, 0.0165])  # half of 28.5 x 32.5 mm, and 28.3 mm behind the gel
     half = robot.tool.stroke[1] / 2

@@ -6,10 +6,9 @@ from both_sides import complaint, sides
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from touchgoal.control.motion.arm_models import UR5E_ARM, JointLimits
-from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics
+from touchgoal.control.motion.arm_models import JointLimits
+from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
-from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.motion.tracker import Tracker
 from touchgoal.control.motion.trajectories import (
     Trajectory,
@@ -24,8 +23,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.deployed_arm import measurements_at_rest
 
 ROBOTS = [
-    (robots.FR3, Fr3Kinematics()),
-    (robots.UR5E, Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)),
+    (robots.FR3, robots.FR3.kinematics()),
+    (robots.UR5E, robots.UR5E.kinematics()),
 ]
 BOTH = pytest.mark.parametrize(("robot", "arm"), ROBOTS, ids=["FR3", "UR5e"])
 DT = 1e-3
@@ -188,12 +187,12 @@ def test_with_commands_lost_the_fingers_stay_in_their_box() -> None:
 
 @sides((0.49e-3, 0.51e-3))
 def test_a_line_that_bends_by_half_a_millimetre_is_refused(value: float, beyond: bool) -> None:
-    class Bent(Fr3Kinematics):
+    class Bent(Kinematics):
         def forward_many(self, q: np.ndarray) -> tuple:
             points, *rest = super().forward_many(q)
             return points + [0, value, 0], *rest
 
-    arm = Bent()
+    arm = Bent(FR3.arm, FR3.tool.tcp_offset)
     end, R = arm.forward(arm.arm.home)
     line = arm, arm.arm.home, end + [0, 0, 0.1], R, FR3.interface
     assert ("passes a singular posture" in complaint(straight_line, *line)) == beyond

@@ -163,7 +163,7 @@ def test_one_deployment_at_a_time_uses_a_twin(fr3: RunningTwin) -> None:
     with lease_twin(fr3.cell.task.twin):
         before = fr3.ask("truth")["layout"]["goal"]
         with pytest.raises(UserError, match="another deploy uses this twin"):
-            connect_cell(fr3.cell, 20)  # of another seed: it would put the scene back
+            connect_cell(fr3.cell)  # of another seed: it would put the scene back
         assert fr3.ask("truth")["layout"]["goal"] == before
     lease_twin(fr3.cell.task.twin).close()
 

@@ -13,7 +13,6 @@ from touchgoal.control import features as ft
 from touchgoal.control.deployment.hand import HandMonitor, HeldObject
 from touchgoal.control.grippers.franka_hand import NonBlockingGripper
 from touchgoal.control.interfaces import Actor, DriverError, GripperReading, LoadReading
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import FR3
 
 NAN = float("nan")
@@ -116,7 +115,7 @@ def test_a_dry_run_imagines_one_consistent_arm() -> None:
     set_(cell.arm, wrench=np.full(6, 2.0))()
     ending = cell.run(lambda _: None, step=0.01, seconds=1.0, width=0.06, execute=False)
     assert not ending.stopped and not cell.gripper.commands
-    kinematics = Kinematics(FR3.arm, FR3.tool.tcp_offset)
+    kinematics = FR3.kinematics()
     for row in cell.rows:
         position, _ = kinematics.forward(row[ft.STATE][:7].astype(float))
         np.testing.assert_allclose(row[ft.TCP_POSE][:3], position, atol=1e-5)

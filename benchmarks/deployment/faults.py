@@ -213,7 +213,7 @@ def _deploy(
     cell: CellConfig, case: FaultCase, episodes: Path, report: Path, broken_at: Path
 ) -> None:
     """Run the deployment in its own process, with a first, short episode before the fault."""
-    connection = connect_cell(cell, ft.CONTROL_HZ)
+    connection = connect_cell(cell)
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     truth = connection.truth
     assert truth is not None

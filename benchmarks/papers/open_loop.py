@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from touchgoal.control.motion.kinematics import Fr3Kinematics
+from touchgoal.control.safety.limits import FR3
 from touchgoal.policies.network import ObservationBatch
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
@@ -63,7 +63,7 @@ def open_loop_errors(plan: Plan, demonstration: SequenceDataset, control_hz: int
 
 def _free_running(plan: Plan, batch: ObservationBatch, control_hz: int) -> Float[np.ndarray, "t 7"]:
     """Return the joints after each tick, where each plan observes the joints compounded so far."""
-    kinematics = Fr3Kinematics()
+    kinematics = FR3.kinematics()
     joints = batch.joints[0].numpy().astype(np.float64)
     states, velocity, course = [], batch.state[0, -1, 7:14].numpy(), []
     quaternion = np.zeros(4)
@@ -94,7 +94,7 @@ def _distance(
 
 
 def _positions(joints: Float[np.ndarray, "... 7"]) -> Float[np.ndarray, "... 3"]:
-    positions, _, _ = Fr3Kinematics().forward_many(joints.reshape(-1, 7).astype(np.float64))
+    positions, _, _ = FR3.kinematics().forward_many(joints.reshape(-1, 7).astype(np.float64))
     return positions.reshape(*joints.shape[:-1], 3)
 
 

@@ -14,7 +14,6 @@ from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.arms.streaming import ArmClient, shift_wrench
 from touchgoal.control.interfaces import ArmReading, Joints
 from touchgoal.control.motion.arm_models import JointLimits
-from touchgoal.control.motion.kinematics import Kinematics
 
 if TYPE_CHECKING:
     import franky
@@ -35,7 +34,7 @@ class FrankaClient(ArmClient):
         self._franky = client = FRANKY.load("franky")
         self._aborted = ""
         model = self.config.robot
-        self._kinematics = Kinematics(model.arm, model.tool.tcp_offset)
+        self._kinematics = model.kinematics()
         # No real-time kernel is asked for: firmware 5.9 and later does without.
         self._robot: franky.Robot = client.Robot(
             self.config.address,

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from touchgoal.control import features as ft
 from touchgoal.control.arms.driver_process import NEVER, DriverProcess, call_timeout, error_line
 from touchgoal.control.interfaces import STOPPED_ON_REQUEST, ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
@@ -26,13 +27,11 @@ _REST, _LOOK = 0.01, 0.05  # rad/s, mean over so many s, below which the arm is 
 
 @dataclass(frozen=True)
 class ArmConfig:
-    """Address of an arm's controller, and rates of its driver."""
+    """Address of an arm's controller, and rate of its driver."""
 
     address: str
     robot: RobotLimits  # geometry, tool and limits
-    # hz, rate: of the incoming commands and of the outgoing stream, Hz
-    hz: float
-    rate: float
+    rate: float  # of the outgoing stream, Hz
     # s without news after which the controller is lost; a loaded simulator needs more
     state_timeout: float
     lock_step: bool = False  # the twin advances only when `advance` is called
@@ -61,8 +60,8 @@ class ArmClient(ABC):
         self._ticked, self._streamed, self._streams = time.monotonic(), 0.0, False
 
     def _make_tracker(self, limits: JointLimits) -> Tracker:
-        config = self.config
-        return Tracker(limits, config.robot.policy.velocity, 1 / config.hz, self._stream_period)
+        speed = self.config.robot.policy.velocity
+        return Tracker(limits, speed, 1 / ft.CONTROL_HZ, self._stream_period)
 
     @abstractmethod
     def _connect(self, recover: bool) -> JointLimits:
@@ -101,7 +100,7 @@ class ArmClient(ABC):
         self._state = self._tracker.set_target(self._state, q)
 
     def stop(self) -> None:
-        """Brake, and take no command until `recover`."""
+        """Brake, and take no command any more."""
         self._refuse_from_now_on(f"{STOPPED_ON_REQUEST}; recover the arm to go on")
 
     def tick(self) -> None:
@@ -175,19 +174,9 @@ class ArmClient(ABC):
 class ArmProcess:
     """Arm over an ArmClient in a child process."""
 
-    def __init__(
-        self,
-        client: type[ArmClient],
-        config: ArmConfig,
-        recover: bool = False,
-        connect_timeout: float = 30.0,
-    ) -> None:
-        timeouts = {
-            "connect_timeout": connect_timeout,
-            "call_timeout": call_timeout(config.lock_step),
-        }
-        self._make = lambda recover: DriverProcess(client, config, recover, **timeouts)
-        self._process = self._make(recover)
+    def __init__(self, client: type[ArmClient], config: ArmConfig, recover: bool = False) -> None:
+        timeout = call_timeout(config.lock_step)
+        self._process = DriverProcess(client, config, recover, call_timeout=timeout)
         self._last: ArmReading = self._process.call("read")
 
     def read(self) -> ArmReading:
@@ -214,17 +203,6 @@ class ArmProcess:
         if self._process.alive:
             with suppress(DriverError):
                 self._process.call("stop")
-
-    def recover(self) -> None:
-        """See Arm."""
-        self._process.close()
-        try:
-            self._process = self._make(True)
-        except DriverError as error:
-            self._process.exit_reason = f"not recovered: {error}"
-            raise
-        if fault := self.read().fault:
-            raise DriverError(f"not recovered: {fault}")
 
     def close(self) -> None:
         """See Arm."""

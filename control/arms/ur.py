@@ -13,7 +13,6 @@ from touchgoal.control.arms.client_libraries import UR_RTDE
 from touchgoal.control.arms.streaming import ArmClient, shift_wrench
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix
 
 RATE = 125.0  # Hz of servoJ; 20 to 500
@@ -31,7 +30,7 @@ class UrClient(ArmClient):
 
     def _connect(self, recover: bool) -> JointLimits:
         robot = self.config.robot
-        self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
+        self._kinematics = robot.kinematics()
         self._refused, self._ended = False, ""
         self._receive = UR_RTDE.load("rtde_receive").RTDEReceiveInterface(self.config.address)
         if recover and self._receive.isProtectiveStopped():

@@ -189,7 +189,7 @@ def _read(
     estimator, pitch = DepthEstimator(calibration), sensor.pixel_pitch
     readings = []
     for touch in touches:
-        read = image_guard.explain(estimator, calibration, touch.plain, touch.background)
+        read = image_guard.explain(estimator, touch.plain, touch.background)
         circle = ball = None
         if ball_radius is not None:
             with suppress(UserError):  # the ball is too faint

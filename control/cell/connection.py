@@ -102,8 +102,8 @@ def _close(device: Any) -> None:
         print(f"{type(device).__name__} did not close: {error}", file=sys.stderr)
 
 
-def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellConnection:
-    """Connect to everything in a cell with a real arm or a twin; commands will come at `hz`.
+def connect_cell(cell: CellConfig, new_episode: bool = True) -> CellConnection:
+    """Connect to everything in a cell with a real arm or a twin.
 
     A twin is taken until the connection closes. It first puts the scene of `task.seed` back, or goes on
     with its own if not `new_episode`. UserError: another program has the twin; or devices do not open,
@@ -135,7 +135,7 @@ def connect_cell(cell: CellConfig, hz: float, new_episode: bool = True) -> CellC
         if cell.load_cell:
             load_cell = opened("load cell", partial(SerialLoadCell, cell.load_cell))
         gripper = opened("gripper", partial(_gripper, cell))
-        arm = opened("arm", partial(connect_arm, cell, hz))
+        arm = opened("arm", partial(connect_arm, cell))
         if not all(row.ok for row in rows):
             print("\n".join(map(str, rows)), flush=True)
             require_all_ok(rows)
@@ -173,7 +173,7 @@ def connect_camera(cell: CellConfig, key: str) -> Camera:
     return VideoCamera(_timed(config, cell))
 
 
-def connect_arm(cell: CellConfig, hz: float, recover: bool = False) -> ArmProcess:
+def connect_arm(cell: CellConfig, recover: bool = False) -> ArmProcess:
     """Connect to a cell's arm alone; `recover` clears a fault first: only when a person asked for it.
 
     DriverError if the arm is missing or refuses the connection.
@@ -181,7 +181,7 @@ def connect_arm(cell: CellConfig, hz: float, recover: bool = False) -> ArmProces
     ur5e = cell.arm == "ur5e"
     rate, timeout = (ur.RATE, ur.STATE_TIMEOUT) if ur5e else (franka.RATE, franka.STATE_TIMEOUT)
     timeout = cell.safety.state_timeout or timeout
-    config = ArmConfig(cell.address, cell_limits(cell), hz, rate, timeout, cell.lock_step)
+    config = ArmConfig(cell.address, cell_limits(cell), rate, timeout, cell.lock_step)
     return ArmProcess(ur.UrClient if ur5e else franka.FrankaClient, config, recover)
 
 

@@ -51,13 +51,14 @@ def lease_twin(address: str) -> socket.socket:
 
 
 def _ask(connection: socket.socket, address: str, line: str) -> dict[str, Any]:
+    """Return the answer to a line; DriverError if none comes, UserError if it is refused."""
     token, _, where = address.rpartition("@")
     try:
         connection.sendall(f"{token} {line}\n".encode())
         with connection.makefile() as answers:
             answer = json.loads(answers.readline())
     except (OSError, json.JSONDecodeError) as error:
-        raise UserError(f"no twin answers at {where}; start one: touchgoal twin") from error
+        raise DriverError(f"no twin answers at {where}; start one: touchgoal twin") from error
     if "error" in answer:
         raise UserError(answer["error"])
     return answer
@@ -94,8 +95,7 @@ class LockStepClock:
         """Stop the twin's time; UserError if none is at the address, or it is not in lock-step."""
         self._arm, self._gripper, self._cameras = arm, gripper, cameras
         self._load_cell = load_cell
-        self._token, self._connection = address.rpartition("@")[0], connect_control_port(address)
-        self._answers = self._connection.makefile()
+        self._address, self._connection = address, connect_control_port(address)
         self._lost = self._driven = False
         self._issued = self._answered = 0
         answer = self._ask("hold")
@@ -143,7 +143,6 @@ class LockStepClock:
 
     def close(self) -> None:
         """Let the twin's time go on by itself."""
-        self._answers.close()  # or the connection stays open
         self._connection.close()
 
     def _let_drivers_tick(self) -> None:
@@ -197,11 +196,7 @@ class LockStepClock:
 
     def _ask(self, line: str) -> dict[str, Any]:
         try:
-            self._connection.sendall(f"{self._token} {line}\n".encode())
-            answer = json.loads(self._answers.readline())
-        except (OSError, json.JSONDecodeError):
+            return _ask(self._connection, self._address, line)
+        except DriverError:
             self._lost = True
             return {}
-        if "error" in answer:
-            raise UserError(answer["error"])
-        return answer

@@ -308,7 +308,7 @@ class ControlLoop:
             action_age=action_age,
             state_age=age(reading.arm.stamp) if self._execute else 0.0,
             gripper_age=age(reading.gripper.stamp),
-            load=self.reader.added_load(reading.load),
+            load=reading.added_load,
         )
 
     def _read(self) -> CellReading:

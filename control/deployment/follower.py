@@ -5,8 +5,8 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
-from touchgoal.control.motion.kinematics import Fr3Kinematics
 from touchgoal.control.motion.rotations import fingers_across
+from touchgoal.control.safety.limits import FR3
 
 GRASP_SECONDS = 0.5  # s for which the hand closes on the bead before it moves
 # Gains, chosen on validation wires.
@@ -27,7 +27,7 @@ class WireFollower(Actor):
 
     def __init__(self, control_hz: int = ft.CONTROL_HZ) -> None:
         self._tick = 1 / control_hz
-        self._kinematics = Fr3Kinematics()
+        self._kinematics = FR3.kinematics()
         self._command: np.ndarray | None = None
         self._grasping = round(GRASP_SECONDS * control_hz)
 

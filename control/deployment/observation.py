@@ -9,8 +9,7 @@ from jaxtyping import Float, UInt8
 from touchgoal.control import features as ft
 from touchgoal.control.arrays import Image
 from touchgoal.control.cell.connection import CellConnection
-from touchgoal.control.interfaces import ArmReading, DriverError, Frame, GripperReading, LoadReading
-from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.interfaces import ArmReading, DriverError, Frame, GripperReading
 from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.fingertip_health import FingertipHealth
 from touchgoal.control.tactile.indentation import IndentationMeter
@@ -27,7 +26,7 @@ class CellReading:
     # arm, gripper: the last readings without NaN, with their own stamps, so that ages show it
     arm: ArmReading
     gripper: GripperReading
-    load: LoadReading | None  # of the load cell; None without one
+    added_load: float  # on the load cell since the first reading, N; 0 without one
     age: float  # of the oldest image, s
     oldest_source: str  # source of that image
     indentation: Float[np.ndarray, "2"]  # depth in left and right gel, m; 0 without fingertips
@@ -50,7 +49,7 @@ class ObservationReader:
                     f"{camera_size[1]} are needed: make them larger where the camera is set"
                 )
         robot = connection.robot
-        self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
+        self._kinematics = robot.kinematics()
         tips = connection.fingertips
         self._health = {key: FingertipHealth(tip.model) for key, tip in tips.items()}
         for key, tip in tips.items():
@@ -79,14 +78,17 @@ class ObservationReader:
         fault = f"arm: {arm.fault}" if arm.fault else ""
         fault = fault or (f"gripper: {gripper.fault}" if gripper.fault else "")
         observation = self.proprioception(arm, gripper)
+        added_load = 0.0
         if load is not None:
             observation[ft.LOAD] = np.array([load.force], np.float32)
+            self._first_load = load.force if self._first_load is None else self._first_load
+            added_load = load.force - self._first_load
         for key, frame in frames.items():
             tactile = key in ft.TACTILE
             observation[key] = frame.image if tactile else crop_and_resize(frame.image, self._size)
         age, (indentation, wrong) = ages.get(oldest, 0.0), self._indentation(frames)
         fault = fault or wrong
-        return CellReading(observation, arm, gripper, load, age, oldest, indentation, fault)
+        return CellReading(observation, arm, gripper, added_load, age, oldest, indentation, fault)
 
     def _without_nan(
         self, arm: ArmReading, gripper: GripperReading
@@ -134,14 +136,6 @@ class ObservationReader:
             if problem:
                 found.append(f"{key.removeprefix(ft.IMAGE_PREFIX)}: {problem}")
         return "; ".join(found)
-
-    def added_load(self, load: LoadReading | None) -> float:
-        """Return the change of the load cell's force (N) since the first reading; 0 without one."""
-        if load is None:
-            return 0.0
-        if self._first_load is None:
-            self._first_load = load.force
-        return load.force - self._first_load
 
     def proprioception(self, arm: ArmReading, gripper: GripperReading) -> dict[str, np.ndarray]:
         """Return state, TCP pose and wrench by their keys."""

@@ -16,7 +16,6 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection, camera_formats
 from touchgoal.control.deployment.hand import require_empty_hand
 from touchgoal.control.interfaces import Camera, TactileSensor
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.fingertip_health import FingertipHealth
 from touchgoal.control.safety.limits import TASK_FORCES
@@ -161,7 +160,7 @@ def _kinematics(connection: CellConnection) -> str:
     reading, robot = connection.arm.read(), connection.robot
     if reading.tcp is None:
         return "the controller has none of its own"
-    nominal, _ = Kinematics(robot.arm, robot.tool.tcp_offset).forward(reading.q)
+    nominal, _ = robot.kinematics().forward(reading.q)
     off = 1e3 * float(np.linalg.norm(reading.tcp - nominal))
     told = f"tool {off:.1f} mm from where the controller has it"
     if off > _OTHER_ARM:

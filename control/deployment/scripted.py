@@ -10,7 +10,6 @@ from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion import trajectories
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.self_collision import SelfDistance, require_no_self_collision
 from touchgoal.control.safety.action_filter import ActionFilter
@@ -112,7 +111,7 @@ def pick_and_place(
     UserError if the arm cannot go there inside its workspace.
     """
     robot = safety.limits
-    kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
+    kinematics = robot.kinematics()
     limits = safety.joints.scaled(_SPEED_SHARE, _SPEED_SHARE)
     x, y, z, yaw = place.grasp
     below = max(corner[2] for corner in robot.tool.finger_corners) - robot.tool.tcp_offset

@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control.arrays import Image
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import (
@@ -26,7 +27,7 @@ from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor, Cost, CostReading
 from touchgoal.control.run_log import SLOW_ARM, RunLog, slow_arm
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.control.sensors.exchanged import Image, cameras_exchanged
+from touchgoal.control.sensors.exchanged import cameras_exchanged
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.tactile.light_gain import light_advice
 from touchgoal.runtime.errors import UserError

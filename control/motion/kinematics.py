@@ -11,9 +11,8 @@ import casadi
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.motion.arm_models import FR3_ARM, ArmModel, Joints
+from touchgoal.control.motion.arm_models import ArmModel, Joints
 from touchgoal.control.motion.rotations import Matrix3, Vector3
-from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.runtime.errors import UserError
 
 # m^2: makes steps finite at a singularity. The squared error is added to it, so that a step from afar
@@ -229,10 +228,3 @@ class Kinematics:
             for i, point in zip(on, points, strict=True)
         ]
         return casadi.Function("points", [q], [casadi.horzcat(*columns)])
-
-
-class Fr3Kinematics(Kinematics):
-    """The FR3 with the Franka Hand."""
-
-    def __init__(self) -> None:
-        super().__init__(FR3_ARM, FRANKA_HAND.tcp_offset)

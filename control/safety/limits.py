@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM, ArmModel, JointLimits
+from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import Vector3
 from touchgoal.control.motion.tool import FRANKA_HAND, ROBOTIQ_2F85, Tool
 
@@ -50,6 +51,10 @@ class RobotLimits:
     force: float = 15.0
     torque: float = 10.0
     indentation: float = 1.5e-3  # m of depth in a gel that stops the arm (`tactile.indentation`)
+
+    def kinematics(self) -> Kinematics:
+        """Return the kinematics of the arm with this tool."""
+        return Kinematics(self.arm, self.tool.tcp_offset)
 
     @property
     def hardware(self) -> JointLimits:
@@ -97,7 +102,7 @@ _LEVER = 0.6  # m: farthest that a hand over the table is from the axis of a joi
 
 @dataclass(frozen=True)
 class TaskForces:
-    """Peaks over a task's successful demonstrations (their number: `episodes`), seeds from 30000.
+    """Peaks over a task's successful demonstrations, seeds from 30000.
 
     `force` is on the hand, N; `indentation` in a gel, m, as `control.tactile.indentation` measures
     it.
@@ -105,7 +110,6 @@ class TaskForces:
 
     force: float
     indentation: float
-    episodes: int
 
     @property
     def force_ceiling(self) -> float:
@@ -126,8 +130,8 @@ class TaskForces:
 # 60 episodes of pick-place, and 60 with --feedback; 29 of the maze with a disturbance of 4 mm/s for
 # the force, and six without for the indentation.
 TASK_FORCES: dict[str, TaskForces] = {
-    "pick-place": TaskForces(force=16.5, indentation=2.1e-3, episodes=120),
-    "bead-maze": TaskForces(force=17.9, indentation=1.15e-3, episodes=29),
+    "pick-place": TaskForces(force=16.5, indentation=2.1e-3),
+    "bead-maze": TaskForces(force=17.9, indentation=1.15e-3),
 }
 
 

@@ -1,6 +1,8 @@
 """MJPEG streams over HTTP: live images in any browser, for machines with and without a screen."""
 
+import math
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -22,7 +24,7 @@ class Stream:
     count: int = 0
     sent: int = 0
     image: Image | None = None
-    ended: bool = False  # whether nobody is served any more
+    lost: float = 0.0  # until when (time.monotonic) clients are cut off and turned away
     condition: threading.Condition = field(default_factory=threading.Condition)
 
     def publish(self, image: Image) -> None:
@@ -38,18 +40,17 @@ class Stream:
 
     def is_open(self) -> bool:
         """Return whether clients are served."""
-        return not self.ended
+        return time.monotonic() >= self.lost
 
     def end(self) -> None:
         """Serve nobody any more."""
-        self.ended = True
+        self.lost = math.inf
 
 
 class StreamServer:
-    """Serves streams at `http://host:port/NAME`; `port` 0: any that is free."""
+    """Serves streams at `http://host:port/NAME`; `port` 0: any that is free. OSError if it is taken."""
 
     def __init__(self, streams: Mapping[str, Stream], host: str, port: int) -> None:
-        """`port` 0: any that is free. Raises OSError if it is taken."""
         self._streams = streams
         handler = type("Handler", (_Handler,), {"streams": streams})
         self._server = ThreadingHTTPServer((host, port), handler)

@@ -51,7 +51,7 @@ class DepthEstimator:
     """
 
     def __init__(self, calibration: SensorCalibration, finest: int = 2) -> None:
-        self._calibration = calibration
+        self.calibration = calibration
         self._schedule = [step for step in _SCHEDULE if step[0] >= finest]
         self._levels = [_Level(calibration, cell) for cell, *_ in self._schedule]
 
@@ -62,7 +62,7 @@ class DepthEstimator:
         Paint markers over in both first (`markers.without_markers`).
         """
         if background is None:
-            background = self._calibration.background.astype(np.float32)
+            background = self.calibration.background.astype(np.float32)
         change = remove_gain(image, background) - background
         surface = np.zeros((1, 1), np.float32)
         for level, (_, steps, searched) in zip(self._levels, self._schedule, strict=True):

@@ -20,7 +20,7 @@ from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.markers.tracker import without_dots
-from touchgoal.control.tactile.sensor_calibration import SensorCalibration, load, shade
+from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
 
@@ -36,12 +36,12 @@ _CLEARLY_MOVED = 0.75  # share of the difference that a better scale or shift ma
 _SAME_UNIT = 0.035  # difference below which the file was made from this very unit
 _OPEN = 1.5  # factor on the difference within which presses have to decide
 _EXPLAINS = 0.8  # share of the unexplained change that a better order or mirror may leave
-UNEXPLAINED = 0.65  # share of a press's change that a sensor file may leave unexplained
+# Share of a press's change that a sensor file may leave unexplained: presses on the file's own unit 0.08
+# to 0.51; on another Mini (PhysiCLeAR) two thirds of them below it; that one's 103 untouched images from
+# 0.72.
+UNEXPLAINED = 0.65
 _PRESSED = 8.0  # counts of local change; simulated units, untouched, reach 6
 _PAINTED = 12.0  # counts: more than the rims of dots painted over leave
-# Share left unexplained: presses on the file's own unit 0.08 to 0.51; on another Mini (PhysiCLeAR) two
-# thirds of them below it; that one's 103 untouched images from 0.72.
-_PRESS_LEFT = 0.65
 _SMOOTH = 4  # degree of the factor by which the light of two units differs
 _MAX_PRESSES = 6  # number of presses that are read
 _CELL = 8  # px of a cell in which changes are averaged; the finest of the depth that is read
@@ -149,8 +149,8 @@ def check_unpressed(image: Image, sensor: SensorModel, name: str) -> None:
     least = _PAINTED if sensor.markers else _PRESSED
     if sensor.images_only or float(change.max()) < least:
         return
-    read = explain(DepthEstimator(calibration, _CELL), calibration, image, background)
-    if read.unexplained <= _PRESS_LEFT:
+    read = explain(DepthEstimator(calibration, _CELL), image, background)
+    if read.unexplained <= UNEXPLAINED:
         raise UserError(
             f"{name} begins in touch: its first frames are taken for the untouched gel, but the "
             "sensor file reads them as pressed; begin with nothing on the gel"
@@ -193,12 +193,11 @@ def check_presses(
     chosen = [presses[i] for i in np.argsort(strength)[::-1][:_MAX_PRESSES]]
     if not others or len(chosen) < 3:
         return
-    calibration = load(sensor.sensor_file)
-    estimator = DepthEstimator(calibration, _CELL)
+    estimator = DepthEstimator(load(sensor.sensor_file), _CELL)
 
     def unexplained(view: _View) -> Float32[np.ndarray, " n"]:
         background = view.undo(untouched).astype(np.float32)
-        read = [explain(estimator, calibration, view.undo(x), background) for x in chosen]
+        read = [explain(estimator, view.undo(x), background) for x in chosen]
         return np.array([explanation.unexplained for explanation in read], np.float32)
 
     as_is = unexplained(_AS_IS)
@@ -222,12 +221,11 @@ class Explanation:
     unexplained: float
 
 
-def explain(
-    estimator: DepthEstimator, calibration: SensorCalibration, frame: Image, background: Counts
-) -> Explanation:
+def explain(estimator: DepthEstimator, frame: Image, background: Counts) -> Explanation:
     """Read a frame's depth and compare the frame with the rendering of that depth."""
     depth = estimator.estimate(frame, background)
     change = remove_gain(frame, background) - background
+    calibration = estimator.calibration
     left = change - (shade(calibration, depth) - calibration.background)
     size = frame.shape[1] // _CELL, frame.shape[0] // _CELL
     strong, rest = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (change, left))

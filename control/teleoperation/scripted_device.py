@@ -27,7 +27,8 @@ _ASIDE = 0.04, 0.02, 0.008
 _TURNED = {"open": (0.8, 0.5, 0.1), "close": (0.1, 0.1, 0.1)}
 _MOST_TURNED = 1.8  # rad about the vertical that the arm reaches everywhere on the table
 _LOW = 0.06  # m; the fingertips are above what is grasped
-_LEFT = 0.12, 0.01  # m above what it let go, mean and standard deviation, where the hand stands still in the end
+# m above what it let go, mean and standard deviation, where the hand stands still in the end
+_LEFT = 0.12, 0.01
 _STILL_TICKS = 8  # ticks without motion: the hand has closed, or the table blocks it
 _STILL = 4e-4  # m of position and of width that count as no motion
 _PLACED = 0.015  # m between hand and goal

@@ -10,26 +10,23 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.teleoperation.device import TeleoperationConfig, TeleoperationDevice
 
 # Speed per force and turning speed per torque at which the hand yields, m/s per N beyond 3 N and rad/s
 # per Nm beyond 0.3 Nm; much more oscillates.
-COMPLIANCE = 2e-3, 0.5
+_COMPLIANCE = 2e-3, 0.5
 _FREE_FORCE = 3.0  # N beyond the first reading that count as none: the weight of a carried object
 
 
 class Compliance:
     """Velocity with which the hand gives way to forces beyond those at rest."""
 
-    def __init__(self, force: float, torque: float, free_torque: float) -> None:
-        """Take the speed per force, m/s per N, and per torque, rad/s per Nm.
-
-        Torques up to `free_torque` (Nm) beyond the first reading count as none.
-        """
-        self._force, self._torque, self._free_torque = force, torque, free_torque
+    def __init__(self, factor: float, free_torque: float) -> None:
+        """Yield `factor` times as much as a led hand; a change of up to `free_torque` (Nm) is none."""
+        self._linear, self._angular = (factor * gain for gain in _COMPLIANCE)
+        self._free_torque = free_torque
 
     def start(self, observation: Observation) -> None:
         """Take the wrench as that of the free hand."""
@@ -38,8 +35,8 @@ class Compliance:
     def velocity(self, observation: Observation) -> Float[np.ndarray, "6"]:
         """Return the hand's velocity, base frame (m/s, rad/s); none where the wrench is unknown."""
         force, torque = (observation[ft.WRENCH] - self._at_rest).reshape(2, 3)
-        moved = self._force * _beyond(force, _FREE_FORCE)
-        return np.concatenate([moved, self._torque * _beyond(torque, self._free_torque)])
+        moved = self._linear * _beyond(force, _FREE_FORCE)
+        return np.concatenate([moved, self._angular * _beyond(torque, self._free_torque)])
 
 
 def _beyond(vector: Float[np.ndarray, "3"], free: float) -> Float[np.ndarray, "3"]:
@@ -65,9 +62,9 @@ class Teleoperator(Actor):
     ) -> None:
         """Begin at rest; `commanded` returns the joints (rad) commanded now."""
         self._device, self._commanded, self._config = device, commanded, config
-        self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
+        self._kinematics = safety.limits.kinematics()
         self._widths = {"close": safety.limits.tool.stroke[0], "open": safety.limits.tool.stroke[1]}
-        self._compliance = Compliance(*COMPLIANCE, _FREE_TORQUE)
+        self._compliance = Compliance(1, _FREE_TORQUE)
         self._dt = safety.dt
 
     def start(self, observation: Observation) -> None:
@@ -105,9 +102,8 @@ class YieldingHand(Compliance):
     def __init__(self, safety: ActionFilter, commanded: Callable[[], np.ndarray]) -> None:
         """Get ready; `commanded` returns the joints (rad) commanded now."""
         self._commanded, self._dt = commanded, safety.dt
-        self._kinematics = Kinematics(safety.limits.arm, safety.limits.tool.tcp_offset)
-        linear, angular = COMPLIANCE
-        super().__init__(_MORE * linear, _MORE * angular, _UNCORRECTED_TORQUE)
+        self._kinematics = safety.limits.kinematics()
+        super().__init__(_MORE, _UNCORRECTED_TORQUE)
 
     def add_to(
         self, action: Float[np.ndarray, " n"], observation: Observation

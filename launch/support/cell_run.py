@@ -21,7 +21,7 @@ def connect(cell: "CellConfig", new_episode: bool = True) -> "CellConnection":
         from touchgoal.sim_envs.cell.in_process import simulate_cell
 
         return simulate_cell(cell, ft.CONTROL_HZ)
-    return connect_cell(cell, ft.CONTROL_HZ, new_episode)
+    return connect_cell(cell, new_episode)
 
 
 def check_cell(cell: "CellConfig", connection: "CellConnection", episodes: Path) -> "ActionFilter":

@@ -8,7 +8,6 @@ from jaxtyping import Float, UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
-from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.sim_envs.cell.estimated_wrench import ForceMonitor
@@ -39,7 +38,7 @@ class SimulatedHardware(ABC):
         self.sensor = find_sensor(config.sensor)
         self.robot = ROBOTS[config.arm]
         self.n_joints = self.robot.arm.home.size
-        self.kinematics = Kinematics(self.robot.arm, self.robot.tool.tcp_offset)
+        self.kinematics = self.robot.kinematics()
         self.grasp_force = 15.0  # N of each finger
         self.bodies: list[Body] = []  # objects of the scene, the task's first
         self._renderers: list[Renderer] = []  # the one in use first

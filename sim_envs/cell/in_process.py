@@ -88,9 +88,6 @@ class _Arm:
             self._refused_because = f"{interfaces.STOPPED_ON_REQUEST}; recover the arm to go on"
         self._cell.brake(self._limits.acceleration)
 
-    def recover(self) -> None:
-        self._refused_because = ""
-
     def close(self) -> None:
         self.stop()
 

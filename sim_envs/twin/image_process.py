@@ -29,11 +29,10 @@ _SENDING_TIMEOUT = 2.0  # s
 class Stream(live_image.Stream):
     """One stream of images, as a camera sends them that may fail."""
 
-    # stalled, frozen, lost, broken, halved: until when (time.monotonic) nothing comes, one image
-    # repeats, clients are cut off and turned away, JPEGs have wrong bytes or are cut in half
+    # stalled, frozen, broken, halved: until when (time.monotonic) nothing comes, one image repeats,
+    # JPEGs have wrong bytes or are cut in half
     stalled: float = 0.0
     frozen: float = 0.0
-    lost: float = 0.0
     broken: float = 0.0
     halved: float = 0.0
 
@@ -60,14 +59,6 @@ class Stream(live_image.Stream):
         if now < self.halved:
             return jpeg[: len(jpeg) // 2]
         return _with_random_bytes(jpeg) if now < self.broken else jpeg
-
-    def is_open(self) -> bool:
-        """Return whether clients are served."""
-        return time.monotonic() >= self.lost
-
-    def end(self) -> None:
-        """Serve nobody any more."""
-        self.lost = np.inf
 
 
 def _with_random_bytes(jpeg: bytes) -> bytes:

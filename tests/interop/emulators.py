@@ -64,7 +64,7 @@ def _connect(server: subprocess.Popen[bytes], address: str) -> ArmProcess:
     while True:
         try:
             return ArmProcess(
-                franka.FrankaClient, ArmConfig(address, FR3, HZ, franka.RATE, franka.STATE_TIMEOUT)
+                franka.FrankaClient, ArmConfig(address, FR3, franka.RATE, franka.STATE_TIMEOUT)
             )
         except DriverError:  # nobody listens yet
             assert server.poll() is None and time.monotonic() < end, "the server does not start"
