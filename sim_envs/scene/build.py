@@ -43,7 +43,9 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
     config = config or SceneConfig()
     spec = _robot(config.arm, config.meshes).copy()
     set_options(spec, config)
-    _compensate_gravity(spec.body("base"))
+    base = spec.body("base")
+    for body in (base, *base.find_all("body")):
+        body.gravcomp = 1
     for side in SIDES:
         add_fingertip(spec, side, find_sensor(config.sensor))
     _add_actuators(spec, config.arm)
@@ -121,12 +123,6 @@ def _strip(spec: mujoco.MjSpec, fast: bool) -> None:
     used = {geom.meshname for body in spec.bodies for geom in body.geoms}
     for mesh in [m for m in spec.meshes if m.name not in used]:
         spec.delete(mesh)
-
-
-def _compensate_gravity(body: mujoco.MjsBody) -> None:
-    body.gravcomp = 1
-    for child in body.bodies:
-        _compensate_gravity(child)
 
 
 def add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
@@ -208,32 +204,24 @@ def arm_joints(arm: str) -> list[str]:
 
 
 def _add_actuators(spec: mujoco.MjSpec, arm: str) -> None:
-    affine = {"gaintype": mujoco.mjtGain.mjGAIN_FIXED, "biastype": mujoco.mjtBias.mjBIAS_AFFINE}
     for i, (name, stiffness) in enumerate(zip(arm_joints(arm), _STIFFNESS[arm], strict=True), 1):
         joint = spec.joint(name)
-        spec.add_actuator(
+        servo = spec.add_actuator(
             name=f"joint_{i}",
             target=joint.name,
             trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            gainprm=[stiffness] + [0] * 9,
-            biasprm=[0, -stiffness, -SERVO_DAMPING * stiffness] + [0] * 7,
             ctrlrange=joint.range.tolist(),
-            ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
-            **affine,
         )
+        servo.set_to_position(stiffness, kv=SERVO_DAMPING * stiffness)
     # One servo on the mean finger opening, stiff enough that the force clamp, set at run time to
     # the grasp force, is what it delivers; the model's own hand is a 100 N/m spring.
-    stiffness, damping = 2.0e4, 200.0
-    spec.add_actuator(
+    servo = spec.add_actuator(
         name="gripper",
         target="split",
         trntype=mujoco.mjtTrn.mjTRN_TENDON,
-        gainprm=[stiffness] + [0] * 9,
-        biasprm=[0, -stiffness, -damping] + [0] * 7,
         forcerange=[-GRIPPER_MAX_FORCE, GRIPPER_MAX_FORCE],
-        forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
-        **affine,
     )
+    servo.set_to_position(2.0e4, kv=200.0)
 
 
 def _add_cameras_and_table(spec: mujoco.MjSpec, tool: Tool) -> None:
