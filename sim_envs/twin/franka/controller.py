@@ -52,7 +52,7 @@ class FrankaArm(Service):
         self._state = ArmState()
         self._reset_setpoint()
         self._state.write_hand(self._ee, self._k)
-        self._load_code()
+        self._estimate_wrench()  # loads compiled code before a client waits for it
         self.link = messages.Link(host, messages.ROBOT_PORT, messages.ROBOT_VERSION, wide=True)
 
     # The twin's loop.
@@ -284,11 +284,6 @@ class FrankaArm(Service):
         self.cell.set_target(now.q, now.dq)
 
     # State.
-
-    def _load_code(self) -> None:
-        contact = self._estimate_wrench()
-        self._state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
-        limits.joint_fault(self._setpoint, self._setpoint)
 
     def _reset_setpoint(self) -> None:
         zero = np.zeros(7)
