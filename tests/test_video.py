@@ -53,7 +53,7 @@ class Streamer:
         threading.Thread(target=self._play, daemon=True).start()
 
     def _play(self) -> None:
-        while self.stream.lost < np.inf:
+        while not self.stream.ended:
             if self.stream.has_viewers:
                 self.count += 1
                 self.stream.publish(numbered(self.count, self.shape))
