@@ -25,17 +25,16 @@ NO_CONTACT: dict[str, Any] = {"contype": 0, "conaffinity": 0}
 """Options of a geom that meets nothing."""
 GRIPPER_MAX_FORCE = 80.0  # N, both fingers; opening never needs a limit below it
 
-_UR5E = Path(__file__).with_name("ur5e.xml")
+# MJCF of each arm; `docs/fr3_model.py` made the FR3's and its meshes.
+MODELS = {
+    "fr3": Path(__file__).parent / "fr3/fr3.xml",
+    "ur5e": Path(__file__).with_name("ur5e.xml"),
+}
 ROBOTS = {"fr3": limits.FR3, "ur5e": limits.UR5E}
 _STIFFNESS = {  # N m/rad: Franka's default (fr3.xml), stiff enough for the UR5e (our choice)
     "fr3": (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0),
     "ur5e": (4500.0, 4500.0, 4500.0, 2000.0, 2000.0, 2000.0),
 }
-
-
-def robot_model() -> Path:
-    """Return the FR3's MJCF; `docs/fr3_model.py` made it and its meshes."""
-    return Path(__file__).parent / "fr3" / "fr3.xml"
 
 
 def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpec:
@@ -61,10 +60,8 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
 @lru_cache(maxsize=4)  # reading and stripping it takes longer than compiling a scene
 def _robot(arm: str, meshes: str) -> mujoco.MjSpec:
     """Return the spec of an arm alone, to be copied."""
-    if arm == "ur5e":
-        spec = mujoco.MjSpec.from_file(str(_UR5E))
-    else:
-        spec = mujoco.MjSpec.from_file(str(robot_model()))
+    spec = mujoco.MjSpec.from_file(str(MODELS[arm]))
+    if arm == "fr3":
         # No posture brings these together (none of 20,000 random ones did), but they lie so near
         # that the solver would examine each pair in every step.
         for i, k in ((0, 2), (2, 4), (3, 5)):
