@@ -332,17 +332,13 @@ class FragileCarryReset:
 
 
 TaskConfig = PickPlaceConfig | BeadMazeConfig | FragileCarryConfig
-TASKS: dict[TaskName, type[TaskConfig]] = {
-    "pick-place": PickPlaceConfig,
-    "bead-maze": BeadMazeConfig,
-    "fragile-carry": FragileCarryConfig,
-}
 ENVS: dict[TaskName, TaskConfig] = {
     "pick-place": PickPlaceConfig(),
     "bead-maze": BeadMazeConfig(split="validation"),
     "fragile-carry": FragileCarryConfig(),
 }
 """Environments in which policies are tried."""
+TASKS: dict[TaskName, type[TaskConfig]] = {name: type(config) for name, config in ENVS.items()}
 
 
 def task_name(config: EnvConfig) -> TaskName:

@@ -14,7 +14,7 @@ from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.scene.build import robot_model
+from touchgoal.sim_envs.scene.build import MODELS
 
 
 @checked_dataclass
@@ -44,7 +44,7 @@ def run(config: Config) -> dict[str, Any]:
 
 def _physics(config: Config) -> list[Row]:
     n = config.physics_steps
-    peer = mujoco.MjModel.from_xml_path(str(robot_model()))
+    peer = mujoco.MjModel.from_xml_path(str(MODELS["fr3"]))
     peer.opt.timestep = 1e-3
     peer_data = mujoco.MjData(peer)
     mujoco.mj_resetDataKeyframe(peer, peer_data, 0)

@@ -1,12 +1,11 @@
 """The simulated cell in 1 kHz steps, with set-points and gripper commands from outside."""
 
 from dataclasses import dataclass
-from typing import Any, no_type_check
+from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
 from touchgoal.control.motion.tracker import SERVO_DAMPING
 from touchgoal.control.safety.limits import braked_velocity
@@ -27,7 +26,7 @@ _TORQUE_FILTER_TIME = _YIELD_TIME = 0.02
 _REFLEX_DECELERATION = 40.0
 
 _ERROR_STREAM = 1  # random stream of the wrench error, beside the seed
-_NO_FORCE = _NO_OFFSET = np.zeros(3)
+_NO_FORCE = NO_OFFSET = np.zeros(3)
 
 Joints = Float[np.ndarray, " n"]
 
@@ -175,7 +174,7 @@ class SimulatedCell:
         return data.qfrc_actuator[dofs] + data.qfrc_gravcomp[dofs]
 
     def kinematics(
-        self, q: Joints, offset: Float[np.ndarray, "3"] = _NO_OFFSET
+        self, q: Joints, offset: Float[np.ndarray, "3"] = NO_OFFSET
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "6 n"]]:
         """Return position (m), rotation and Jacobian of a point `offset` m from the TCP."""
         env, data = self.env, self._scratch
@@ -223,21 +222,8 @@ class SimulatedCell:
     def _note_extremes(self) -> None:
         limits, worst = self.env.robot.hardware, self.worst
         # excess, speed: as of `worst`, now
-        self.excess, self.speed, fastest = _extremes(
-            self.q, self.dq, limits.lower, limits.upper, limits.velocity
-        )
+        self.excess = float(np.maximum(limits.lower - self.q, self.q - limits.upper).max())
+        self.speed = float((np.abs(self.dq) / limits.velocity).max())
         worst.excess, worst.speed = max(worst.excess, self.excess), max(worst.speed, self.speed)
-        if fastest > AT_REST:
+        if self.moving:
             self._rest_since = self.time
-
-
-@njit(cache=True)
-@no_type_check
-def _extremes(q, dq, lower, upper, velocity):
-    """Return the largest excess over a joint's range (rad), share of its speed, speed (rad/s)."""
-    excess, share, fastest = -np.inf, 0.0, 0.0
-    for i in range(len(q)):
-        excess = max(excess, lower[i] - q[i], q[i] - upper[i])
-        share = max(share, abs(dq[i]) / velocity[i])
-        fastest = max(fastest, abs(dq[i]))
-    return excess, share, fastest

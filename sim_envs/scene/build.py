@@ -25,7 +25,11 @@ NO_CONTACT: dict[str, Any] = {"contype": 0, "conaffinity": 0}
 """Options of a geom that meets nothing."""
 GRIPPER_MAX_FORCE = 80.0  # N, both fingers; opening never needs a limit below it
 
-_UR5E = Path(__file__).with_name("ur5e.xml")
+# MJCF of each arm; `docs/fr3_model.py` made the FR3's and its meshes.
+MODELS = {
+    "fr3": Path(__file__).parent / "fr3/fr3.xml",
+    "ur5e": Path(__file__).with_name("ur5e.xml"),
+}
 ROBOTS = {"fr3": limits.FR3, "ur5e": limits.UR5E}
 _STIFFNESS = {  # N m/rad: Franka's default (fr3.xml), stiff enough for the UR5e (our choice)
     "fr3": (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0),
@@ -33,17 +37,14 @@ _STIFFNESS = {  # N m/rad: Franka's default (fr3.xml), stiff enough for the UR5e
 }
 
 
-def robot_model() -> Path:
-    """Return the FR3's MJCF; `docs/fr3_model.py` made it and its meshes."""
-    return Path(__file__).parent / "fr3" / "fr3.xml"
-
-
 def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpec:
     """Build the scene's spec; tasks add to it before they compile it."""
     config = config or SceneConfig()
     spec = _robot(config.arm, config.meshes).copy()
     set_options(spec, config)
-    _compensate_gravity(spec.body("base"))
+    base = spec.body("base")
+    for body in (base, *base.find_all("body")):
+        body.gravcomp = 1
     for side in SIDES:
         add_fingertip(spec, side, find_sensor(config.sensor))
     _add_actuators(spec, config.arm)
@@ -59,10 +60,8 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
 @lru_cache(maxsize=4)  # reading and stripping it takes longer than compiling a scene
 def _robot(arm: str, meshes: str) -> mujoco.MjSpec:
     """Return the spec of an arm alone, to be copied."""
-    if arm == "ur5e":
-        spec = mujoco.MjSpec.from_file(str(_UR5E))
-    else:
-        spec = mujoco.MjSpec.from_file(str(robot_model()))
+    spec = mujoco.MjSpec.from_file(str(MODELS[arm]))
+    if arm == "fr3":
         # No posture brings these together (none of 20,000 random ones did), but they lie so near
         # that the solver would examine each pair in every step.
         for i, k in ((0, 2), (2, 4), (3, 5)):
@@ -121,12 +120,6 @@ def _strip(spec: mujoco.MjSpec, fast: bool) -> None:
     used = {geom.meshname for body in spec.bodies for geom in body.geoms}
     for mesh in [m for m in spec.meshes if m.name not in used]:
         spec.delete(mesh)
-
-
-def _compensate_gravity(body: mujoco.MjsBody) -> None:
-    body.gravcomp = 1
-    for child in body.bodies:
-        _compensate_gravity(child)
 
 
 def add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
@@ -208,32 +201,24 @@ def arm_joints(arm: str) -> list[str]:
 
 
 def _add_actuators(spec: mujoco.MjSpec, arm: str) -> None:
-    affine = {"gaintype": mujoco.mjtGain.mjGAIN_FIXED, "biastype": mujoco.mjtBias.mjBIAS_AFFINE}
     for i, (name, stiffness) in enumerate(zip(arm_joints(arm), _STIFFNESS[arm], strict=True), 1):
         joint = spec.joint(name)
-        spec.add_actuator(
+        servo = spec.add_actuator(
             name=f"joint_{i}",
             target=joint.name,
             trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            gainprm=[stiffness] + [0] * 9,
-            biasprm=[0, -stiffness, -SERVO_DAMPING * stiffness] + [0] * 7,
             ctrlrange=joint.range.tolist(),
-            ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
-            **affine,
         )
+        servo.set_to_position(stiffness, kv=SERVO_DAMPING * stiffness)
     # One servo on the mean finger opening, stiff enough that the force clamp, set at run time to
     # the grasp force, is what it delivers; the model's own hand is a 100 N/m spring.
-    stiffness, damping = 2.0e4, 200.0
-    spec.add_actuator(
+    servo = spec.add_actuator(
         name="gripper",
         target="split",
         trntype=mujoco.mjtTrn.mjTRN_TENDON,
-        gainprm=[stiffness] + [0] * 9,
-        biasprm=[0, -stiffness, -damping] + [0] * 7,
         forcerange=[-GRIPPER_MAX_FORCE, GRIPPER_MAX_FORCE],
-        forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
-        **affine,
     )
+    servo.set_to_position(2.0e4, kv=200.0)
 
 
 def _add_cameras_and_table(spec: mujoco.MjSpec, tool: Tool) -> None:

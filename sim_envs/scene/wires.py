@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.runtime import seeds
-from touchgoal.runtime.errors import UserError, unknown_name
+from touchgoal.runtime.errors import UserError
 
 Family = Literal["fourier", "roller", "helix", "arc", "serpentine"]
 Split = Literal["training", "validation", "test"]
@@ -138,11 +138,6 @@ def choose(split: Split, count: int, families: tuple[Family, ...] = TRAINED) -> 
 
     Within a family no two wires of any split are closer than `APART`.
     """
-    if split not in seeds.WIRES:
-        raise unknown_name("split", split, seeds.WIRES)
-    for family in families:
-        if family not in FAMILIES:
-            raise unknown_name("family", family, FAMILIES)
     each = -(-count // len(families))
     if each > PER_FAMILY[split]:
         raise UserError(

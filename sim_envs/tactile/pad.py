@@ -213,7 +213,6 @@ class TactilePad:
             else:
                 kind, size = int(self._model.geom_type[geom]), self._model.geom_size[geom]
                 shape = partial(add_primitive, kind=kind, size=size)
-            position, rotation = position.astype(np.float32), rotation.astype(np.float32)
             placed.append(partial(shape, position=position, rotation=rotation))
         return placed
 

@@ -4,12 +4,10 @@ import math
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import no_type_check
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int8, Int16, UInt8
-from numba import njit
 
 from touchgoal.control.tactile.sensor_calibration import (
     SensorCalibration,
@@ -78,46 +76,27 @@ def sample_instance(
     )
     h, w = sensor.image_shape
     smooth = cv2.resize(rng.normal(0, 1, (4, 5, 3)), (w, h), interpolation=cv2.INTER_CUBIC)
-    offset, background = randomization.offset * rng.normal(size=3), np.empty((3, h, w), np.int16)
-    _tint(typical.background, brightness, offset, randomization.pattern, smooth, background)
+    offset = randomization.offset * rng.normal(size=3)
+    counts = typical.background * brightness + (offset + randomization.pattern * smooth)
     tile = h + NOISE_MARGIN, w + NOISE_MARGIN
     shared, own = rng.standard_normal(tile), rng.standard_normal((*tile, 3))
-    noise = np.empty((3, *tile), np.int8)
-    _mix(shared, own, typical.noise / COUNT_STEP, noise)
+    noise = typical.noise / COUNT_STEP * (_SHARED * shared[..., None] + _OWN * own)
     markers, radius = _markers(sensor, pitch, randomization.markers, rng)
     blurred = sensor.defocus * randomization.defocus
     return SensorInstance(
         calibration,
-        background,
+        _planes(counts / COUNT_STEP, np.int16),
         light,
-        noise,
+        _planes(noise.clip(-127, 127), np.int8),
         markers,
         radius,
         rng.uniform(0, blurred) if blurred else 0.0,
     )
 
 
-@njit(cache=True)
-@no_type_check
-def _tint(background, brightness, offset, pattern, smooth, out):
-    """Write a background of other lights and an uneven gel to planes, in units of COUNT_STEP."""
-    for i in range(out.shape[1]):
-        for j in range(out.shape[2]):
-            for c in range(3):
-                counts = background[i, j, c] * brightness[c]
-                counts += offset[c] + pattern * smooth[i, j, c]
-                out[c, i, j] = np.int16(counts / COUNT_STEP)
-
-
-@njit(cache=True)
-@no_type_check
-def _mix(shared, own, size, out):
-    """Write noise of a size to planes: 0.3 of its variance is the same in all channels."""
-    for i in range(shared.shape[0]):
-        for j in range(shared.shape[1]):
-            for c in range(3):
-                value = size * (_SHARED * shared[i, j] + _OWN * own[i, j, c])
-                out[c, i, j] = np.int8(min(max(value, -127.0), 127.0))
+def _planes(pixels: Float[np.ndarray, "h w 3"], kind: type) -> np.ndarray:
+    """Return numbers by pixel and channel as one plane of integers for each channel."""
+    return np.moveaxis(pixels, -1, 0).astype(kind, order="C")
 
 
 def _typical(sensor: SensorModel) -> tuple[SensorCalibration, Float32[np.ndarray, "3 h3 w3"]]:

@@ -6,14 +6,13 @@ guiding.
 """
 
 import time
-from pathlib import Path
 
 import numpy as np
 
 from touchgoal.control.safety.limits import FR3
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
-from touchgoal.sim_envs.scene.build import robot_model
+from touchgoal.sim_envs.scene.build import MODELS
 from touchgoal.sim_envs.twin.franka import limits, messages
 from touchgoal.sim_envs.twin.franka.arm_state import OTHER, ArmState, Motion, end_effector
 from touchgoal.sim_envs.twin.franka.limits import Setpoint
@@ -52,7 +51,7 @@ class FrankaArm(Service):
         self._state = ArmState()
         self._reset_setpoint()
         self._state.write_hand(self._ee, self._k)
-        self._load_code()
+        self._estimate_wrench()  # loads compiled code before a client waits for it
         self.link = messages.Link(host, messages.ROBOT_PORT, messages.ROBOT_VERSION, wide=True)
 
     # The twin's loop.
@@ -178,7 +177,7 @@ class FrankaArm(Service):
             else:
                 self._recovery, self._cleared = request, False
         elif command == RobotCommand.GET_ROBOT_MODEL:
-            urdf = Path(robot_model()).with_name("fr3_clean.urdf").read_bytes()
+            urdf = MODELS["fr3"].with_name("fr3_clean.urdf").read_bytes()
             self.link.answer(request, 0, urdf)
         elif command in _SETTERS:
             self._configure(request)
@@ -284,11 +283,6 @@ class FrankaArm(Service):
         self.cell.set_target(now.q, now.dq)
 
     # State.
-
-    def _load_code(self) -> None:
-        contact = self._estimate_wrench()
-        self._state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
-        limits.joint_fault(self._setpoint, self._setpoint)
 
     def _reset_setpoint(self) -> None:
         zero = np.zeros(7)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.limits import UR5E
-from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
+from touchgoal.sim_envs.cell.simulated_cell import DT, NO_OFFSET, SimulatedCell
 
 _READY, DONE = 1, 2
 # Numbers of ur-rtde's commands.
@@ -103,9 +103,9 @@ class UrProgram:
             if not self._waiting and self.running:
                 self.ints[0] = DONE
 
-    def pose(self, q: Float[np.ndarray, "6"]) -> Pose:
-        """Return the TCP's pose at joint positions (rad), base frame."""
-        position, R, _ = self.cell.kinematics(q)
+    def pose(self, q: Joints, offset: Float[np.ndarray, "3"] = NO_OFFSET) -> Pose:
+        """Return the TCP's pose at joint positions (rad), or a point's `offset` (m) from it, base frame."""
+        position, R, _ = self.cell.kinematics(q, offset)
         return np.concatenate([position, rotation_vector(R)])
 
     # Commands.
@@ -148,9 +148,8 @@ class UrProgram:
 
     def _forward_kinematics(self) -> None:
         """Answer the pose of a tool that is shifted from the flange, not turned, at joint positions."""
-        position, R, _ = self.cell.kinematics(self._goal())
         shift = np.array([self._double(i) for i in (6, 7, 8)]) - [0, 0, UR5E.tool.tcp_offset]
-        self.doubles[:6] = [*position + R @ shift, *rotation_vector(R)]
+        self.doubles[:6] = self.pose(self._goal(), shift).tolist()
 
     # Registers.
 
