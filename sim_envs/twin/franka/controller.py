@@ -51,7 +51,7 @@ class FrankaArm(Service):
         self._state = ArmState()
         self._reset_setpoint()
         self._state.write_hand(self._ee, self._k)
-        self._estimate_wrench()  # loads compiled code before a client waits for it
+        self._load_code()
         self.link = messages.Link(host, messages.ROBOT_PORT, messages.ROBOT_VERSION, wide=True)
 
     # The twin's loop.
@@ -283,6 +283,11 @@ class FrankaArm(Service):
         self.cell.set_target(now.q, now.dq)
 
     # State.
+
+    def _load_code(self) -> None:
+        contact = self._estimate_wrench()
+        self._state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
+        limits.joint_fault(self._setpoint, self._setpoint)
 
     def _reset_setpoint(self) -> None:
         zero = np.zeros(7)

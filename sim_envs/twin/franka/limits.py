@@ -22,6 +22,15 @@ _DAMPING = 1e-8  # m^2: makes the wrench at a singular pose finite
 _NEVER_ZERO = 1e-6  # N: a measured estimate is never exactly 0
 
 
+_TAPER = FR3.hardware.taper
+assert _TAPER is not None  # the FR3's speeds shrink near the ends of its ranges
+_HARDWARE = (
+    *(FR3.hardware.lower, FR3.hardware.upper, FR3.hardware.velocity),
+    *(FR3.hardware.acceleration, FR3.hardware.jerk),
+    *(_TAPER.gain, _TAPER.lower, _TAPER.upper, _TAPER.offset),
+)
+
+
 @dataclass(frozen=True)
 class Setpoint:
     """A joint set-point with its derivatives: rad, rad/s, rad/s^2."""
@@ -38,19 +47,40 @@ def next_setpoint(before: Setpoint, q: Joints) -> Setpoint:
 
 
 def joint_fault(before: Setpoint, now: Setpoint) -> str | None:
-    """Return libfranka's name of the first limit that a set-point breaks; None if none."""
-    limits = FR3.hardware
-    lowest, highest = limits.speed_range(now.q)
-    outward = np.where(now.q > limits.upper, now.dq, np.where(now.q < limits.lower, -now.dq, 0.0))
-    broken = {
-        "position_limits_violation": ~np.isfinite(now.q) | (outward > 1e-3),
-        "velocity_limits_violation": (now.dq > _SLACK * highest + 1e-3)
-        | (now.dq < _SLACK * lowest - 1e-3),
-        "velocity_discontinuity": np.abs(now.ddq) > _SLACK * limits.acceleration,
-        "acceleration_discontinuity": np.abs(now.ddq - before.ddq) > _SLACK * DT * limits.jerk,
-    }
-    name = next((name for name, joints in broken.items() if joints.any()), None)
-    return name and f"joint_motion_generator_{name}"
+    """Return libfranka's name of the limit that a set-point breaks; None if none."""
+    broken = _broken_limit(now.q, now.dq, now.ddq, before.ddq, *_HARDWARE)
+    return None if broken < 0 else f"joint_motion_generator_{_LIMITS[broken]}"
+
+
+_LIMITS = (
+    "position_limits_violation",
+    "velocity_limits_violation",
+    "velocity_discontinuity",
+    "acceleration_discontinuity",
+)
+
+
+@njit(cache=True)
+@no_type_check
+def _broken_limit(
+    q, dq, ddq, ddq_before, lower, upper, velocity, acceleration, jerk, gain, below, above, offset
+):
+    """Return the first of `_LIMITS` that a joint breaks, or -1; see `JointLimits.speed_range`."""
+    worst = len(_LIMITS)
+    for i in range(len(q)):
+        up = np.sqrt(max(gain[i] * (above[i] - q[i]), 0.0)) - offset[i]
+        down = np.sqrt(max(gain[i] * (q[i] - below[i]), 0.0)) - offset[i]
+        highest, lowest = min(max(up, 0.0), velocity[i]), -min(max(down, 0.0), velocity[i])
+        outward = dq[i] if q[i] > upper[i] else -dq[i] if q[i] < lower[i] else 0.0
+        if not np.isfinite(q[i]) or outward > 1e-3:
+            worst = 0
+        elif dq[i] > _SLACK * highest + 1e-3 or dq[i] < _SLACK * lowest - 1e-3:
+            worst = min(worst, 1)
+        elif abs(ddq[i]) > _SLACK * acceleration[i]:
+            worst = min(worst, 2)
+        elif abs(ddq[i] - ddq_before[i]) > _SLACK * DT * jerk[i]:
+            worst = min(worst, 3)
+    return worst if worst < len(_LIMITS) else -1
 
 
 def arm_fault(excess: float, speed: float) -> str | None:
