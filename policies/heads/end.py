@@ -7,6 +7,9 @@ from torch import Tensor, nn
 from touchgoal.policies.heads.mlp import readout
 
 END_SECONDS = 0.5  # s at the end of a successful recording in which the task is done
+LEAVING_SECONDS = (
+    1.5  # s, the same where a hand is seen to leave what it let go: it slows down where it stops
+)
 # s for which its probability must last in recordings, which stop soon after the end; for a policy this is
 # enough where they go on after success. Elsewhere an object that hovers over its place looks nearly done.
 LASTING, _DONE_SECONDS = 0.3, 0.8
@@ -22,6 +25,7 @@ class EndOutput(nn.Module):
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
+        # an input of infinite scale is not read
         self.mean, self.scale = nn.Buffer(torch.zeros(inputs)), nn.Buffer(torch.ones(inputs))
         self.limit = nn.Buffer(torch.tensor(torch.inf))
         # whether the recordings go on after success: no motion is taught there, so the arm stands still

@@ -3,17 +3,22 @@
 import torch
 import torch.nn.functional as F
 from accelerate.utils import send_to_device
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from touchgoal.policies.heads.end import LASTING, EndOutput
 from touchgoal.policies.network import PolicyNetwork
+from touchgoal.policies.perception.proprioception import input_widths
+from touchgoal.policies.sight.key_pose import KEY_POSE_DIM
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 _STEPS, _PASSES, _BATCH = 1500, 100, 512  # steps and passes over the data at most
 _RATE, _DECAY, _NOISE = 1e-3, 1e-2, 0.1
+_LEAST_SPREAD = (
+    0.05  # of an input by sight: less is divided by this, since few recordings show its variation
+)
 _ROWS = 1024  # windows that are encoded at once
-_EARLY = 1.0  # s before a recording's end at which it is not done
+_EARLY = 0.5  # s before the end of a recording begins at which it is not done
 _LEAST_LIMIT = 0.5
 _LEAST_SHARE, _FEWEST = 0.5, 5  # share of the ends that must be noticed, of so many at least
 
@@ -23,8 +28,8 @@ def fit_end(
 ) -> tuple[int, int]:
     """Fit the end output to windows; return how many of the successful validation episodes it ends.
 
-    The second number is that of these episodes. The limit is the least that no validation episode exceeds a
-    second before its end; infinite if fewer than half of the ends, or of 5 episodes, exceed it.
+    The second number is that of these episodes. The limit is the least that no validation episode exceeds
+    half a second before its end begins; infinite if fewer than half of the ends, or of 5 episodes, exceed it.
     """
     assert policy.end is not None, "the policy has no end output"
     condition, done = _conditions(policy, windows), windows.recorded.done.float()
@@ -32,7 +37,8 @@ def fit_end(
         torch.manual_seed(seed)
         end = EndOutput(condition.shape[1]).requires_grad_(True)
     end.mean.copy_(condition.mean(0))
-    end.scale.copy_(condition.std(0).clamp(min=1e-6))
+    end.scale.copy_(condition.std(0).clamp(min=_LEAST_SPREAD if policy.key_pose else 1e-6))
+    end.scale[~_read_by_end(policy)] = torch.inf
     inputs, generator = end.scaled(condition), torch.Generator().manual_seed(seed)
     optimiser = torch.optim.AdamW(end.parameters(), _RATE, weight_decay=_DECAY)
     for _ in range(min(_STEPS, _PASSES * -(-len(inputs) // _BATCH))):
@@ -48,6 +54,20 @@ def fit_end(
     return ended
 
 
+def _read_by_end(policy: PolicyNetwork) -> Bool[Tensor, " c"]:
+    """Return which of the head's inputs the end output reads: with cameras the gripper's width and the key pose.
+
+    It would else learn the turns and tilts of the hand at the few ends that it is shown.
+    """
+    config, read = policy.config, torch.ones(policy.condition_dim, dtype=torch.bool)
+    if policy.key_pose:
+        ticks = read[:-KEY_POSE_DIM].view(config.observation_horizon, -1)
+        ticks[:] = False
+        _, *others = input_widths(config.proprioception, config.representation)
+        ticks[:, -sum(others) - 1] = True
+    return read
+
+
 def _set_limit(
     end: EndOutput, policy: PolicyNetwork, validation: SequenceDataset
 ) -> tuple[int, int]:
@@ -56,7 +76,7 @@ def _set_limit(
     found, lengths = end(_conditions(policy, validation)), list(recorded.lengths)
     for episode, done in zip(found.split(lengths), recorded.done.split(lengths), strict=True):
         lasting = episode.unfold(0, min(round(LASTING * hz), len(episode)), 1).amin(1)
-        before += lasting[: -round(_EARLY * hz) if done[-1] else None].tolist()
+        before += lasting[: -int(done.sum()) - round(_EARLY * hz) if done[-1] else None].tolist()
         last += [lasting.max().item()] * bool(done[-1])
     limit = max(before)
     ended = sum(value > limit for value in last)

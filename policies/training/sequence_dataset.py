@@ -13,7 +13,7 @@ from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.episodes.schema import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
-from touchgoal.policies.heads.end import END_SECONDS
+from touchgoal.policies.heads.end import END_SECONDS, LEAVING_SECONDS
 from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
@@ -92,7 +92,7 @@ def load_recordings(
     return Recordings(
         *parts,
         lengths=lengths,
-        done=_done(episodes, chosen, lengths, config.control_hz),
+        done=_done(episodes, chosen, actions, config),
         succeeded=torch.from_numpy(np.concatenate(succeeded)),
         images=torch.from_numpy(np.concatenate(differences)) if config.end_to_end else None,
         maps=torch.from_numpy(np.concatenate(maps)) if images else None,
@@ -101,13 +101,21 @@ def load_recordings(
 
 
 def _done(
-    episodes: EpisodeSet, chosen: Sequence[int], lengths: Sequence[int], hz: int
+    episodes: EpisodeSet, chosen: Sequence[int], actions: list[np.ndarray], config: PolicyConfig
 ) -> Bool[Tensor, " n"]:
-    """Return the last `END_SECONDS` of each episode but those corrected ones that failed."""
-    metas, ticks = [episodes.meta(i) for i in chosen], round(END_SECONDS * hz)
-    good = [meta.get("outcome") != CORRECTED or bool(meta.get("success")) for meta in metas]
-    ends = zip(lengths, good, strict=True)
-    return torch.cat([(torch.arange(n) >= n - ticks) & success for n, success in ends])
+    """Return the last `END_SECONDS` of each episode but those corrected ones that failed.
+
+    With cameras `LEAVING_SECONDS` since the gripper last moved, if that is longer.
+    """
+    ends, leaving = (round(s * config.control_hz) for s in (END_SECONDS, LEAVING_SECONDS))
+    marks = []
+    for i, action in zip(chosen, actions, strict=True):
+        meta, n = episodes.meta(i), len(action)
+        moved = np.flatnonzero(np.diff(action[:, -1], prepend=np.nan))[-1]
+        ticks = max(ends, min(leaving, n - moved)) if config.images else ends
+        good = meta.get("outcome") != CORRECTED or bool(meta.get("success"))
+        marks.append((torch.arange(n) >= n - ticks) & good)
+    return torch.cat(marks)
 
 
 def _check(
