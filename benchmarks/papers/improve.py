@@ -23,7 +23,7 @@ from benchmarks.deployment.own_task import OBJECT, TASK, demonstrate, touchgoal
 from benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.twin_client import ask_twin
-from touchgoal.episodes.outcomes.judged import JudgedOutcome
+from touchgoal.episodes.outcomes.judged import JudgedOutcome, write_judged
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.improve import judge_set, train_accepted
 from touchgoal.policies.evaluation.success_rate import SuccessRate
@@ -123,15 +123,31 @@ class _Lab:
         true = parse_json(file.read_bytes())
         return SuccessRate(sum(true), len(true))
 
-    def improve(self, name: Filter, data: Path, validation: Path, rounds: int) -> Improvement:
+    def label(self, name: Filter, data: Path, episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
+        """Return what a filter says of demonstrations and runs."""
+        if name == "judge":
+            return judge_set(str(self.judge), episodes)
+        if name == "none":
+            return everything(episodes)
+        true = [True] * len(EpisodeSet(data)) + parse_json((self.out / name / _TRUTH).read_bytes())
+        return {i: JudgedOutcome("success" if t else "failure") for i, t in enumerate(true)}
+
+    def overrule(self, name: Filter, data: Path) -> None:
+        """Write what a filter says over the verdicts of the judge, which has told its own as it ended the runs."""
+        if name != "judge":
+            episodes = EpisodeSet(self.out / name / "episodes")
+            write_judged(episodes, self.label(name, data, episodes))
+
+    def improve(self, name: Filter, data: Path, validation: Path) -> Improvement:
         """Return what goes through rounds with a filter; no round is done yet."""
-        folder, train = self.out / name, partial(train_accepted, validation, self.config.train)
-        label = {
-            "judge": partial(judge_set, str(self.judge)),
-            "truth": partial(_truth, folder, len(EpisodeSet(data))),
-            "none": everything,
-        }[name]
-        return Improvement(folder, data, self.config.runs, self.record, label, train)
+
+        def record(policy: Path, root: Path, numbers: range) -> None:
+            self.record(policy, root, numbers)
+            self.overrule(name, data)
+
+        label = partial(self.label, name, data)
+        train = partial(train_accepted, validation, self.config.train)
+        return Improvement(self.out / name, data, self.config.runs, record, label, train)
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -148,7 +164,7 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
     if not (lab.judge / JUDGE).exists():
         shutil.rmtree(lab.judge, ignore_errors=True)
         touchgoal("fit-normalizer", data, "--value", "--judge", "--out", lab.judge)
-    first = lab.improve("none", data, validation, 0)
+    first = lab.improve("none", data, validation)
     for _ in first.rounds(0):
         pass
     root = first.out / "episodes"
@@ -156,12 +172,14 @@ def _run(config: Config, out: Path) -> dict[str, Any]:
         lab.record(first.policy(0), root, range(done, config.runs))
     for name in config.filters:
         go_on_from(first.out, out / name)
+    for name in config.filters:
+        lab.overrule(name, data)
 
     twins = max(1, config.workers // len(config.filters))
 
     def improved(job: tuple[int, Filter]) -> dict[str, Any]:
         own = _Lab(config, out, 1 + job[0])
-        work = own.improve(job[1], data, validation, config.rounds)
+        work = own.improve(job[1], data, validation)
         said = [v for done in work.rounds(config.rounds) for v in done.verdicts]
         true = parse_json((work.out / _TRUTH).read_bytes())
         accepted = [t for t, v in zip(true, said, strict=True) if v == "success"]
@@ -204,8 +222,3 @@ def go_on_from(first: Path, folder: Path) -> None:
 def everything(episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
     """Accept all episodes of a set."""
     return {i: JudgedOutcome("success") for i in range(len(episodes))}
-
-
-def _truth(folder: Path, first: int, episodes: EpisodeSet) -> dict[int, JudgedOutcome]:
-    true = [True] * first + parse_json((folder / _TRUTH).read_bytes())
-    return {i: JudgedOutcome("success" if t else "failure") for i, t in enumerate(true)}
