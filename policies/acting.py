@@ -118,6 +118,7 @@ class LearnedPolicy(Planner):
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
         self._maps: tuple[Observation, Tensor] | None = None  # the latest embedded camera images
         self._novel_plans = self._done_plans = 0  # in a row
+        self._changes = 0  # of the gripper
         self._key_pose = KeyPoseAverage(self.execution_horizon / self.control_hz)
         self._width: float | None = None  # of the gripper, where the next plan begins, m
 
@@ -157,6 +158,7 @@ class LearnedPolicy(Planner):
             self._refuse_novel(batch)
             plan = self._network.plan(batch, self._generator, self._width, self._key_pose)
             actions, done = plan.actions[0].numpy(), bool(plan.done[0])
+            done &= self._changes >= self.config.gripper_changes
             self._done_plans = self._done_plans + 1 if done else 0
             if (end := self._network.end) is not None:
                 actions[:, :-1] *= not (done and end.stands)
@@ -171,6 +173,7 @@ class LearnedPolicy(Planner):
             width = float(actions[self.execution_horizon - 1, -1])
             if self._width not in (None, width):
                 self._key_pose.change_gripper()
+                self._changes += 1
             self._width = width
             return actions
 

@@ -98,8 +98,10 @@ def train(
 def untrained(policy: PolicyConfig, windows: SequenceDataset, seed: int) -> PolicyNetwork:
     """Return a network with random weights, its normalizers and gripper widths fitted to windows."""
     recorded = windows.recorded
-    widths = recorded.actions[:, -1].unique().tolist()
-    policy = replace(policy, gripper_widths=tuple(widths) if len(widths) == 2 else ())
+    widths = recorded.actions[:, -1]
+    if len(levels := widths.unique().tolist()) == 2:
+        changes = min(int(w.diff().count_nonzero()) for w in widths.split(list(recorded.lengths)))
+        policy = replace(policy, gripper_widths=tuple(levels), gripper_changes=changes)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = PolicyNetwork(policy)
