@@ -47,6 +47,8 @@ def test_a_policy_is_done_once_it_has_looked_so_for_a_while() -> None:
     moved = actor.act(dict(tick))[:7].any()
     actor = LearnedPolicy(_fitted(LIFTED, goes_on=True)[0], None)
     assert moved and said(LIFTED, 12)[-1] and not actor.act(dict(tick))[:7].any()
+    actor.config = replace(actor.config, gripper_changes=1)
+    assert not said(LIFTED, 24)[-1]  # an end before the hand has let go is none
     actor.reset()
     assert not actor.done
 

@@ -1,6 +1,7 @@
 """The next key pose: its labels, its frames, places never recorded, and when the gripper may change."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from touchgoal.policies.sight.estimates import FIXED, GROUPS, estimate_from, lik
 from touchgoal.policies.sight.frozen_images import ImageInputConfig
 from touchgoal.policies.sight.key_pose import face_any_way, key_poses, set_beside, true_pose
 from touchgoal.policies.sight.readout import CameraReadout, KeyPoseReadout, errors
+from touchgoal.policies.training.end import read_by_end
 
 
 @pytest.mark.parametrize(
@@ -249,6 +251,10 @@ def test_the_gripper_changes_where_the_hand_rests_at_a_key_pose_and_no_velocity_
     state = torch.randn(1, 2, 22) / 10
     state[..., 15:] = _poses(np.random.default_rng(0), 1)[:, None]  # at rest
     batch = ObservationBatch(torch.empty(1, 2, 0), state, maps=torch.randn(1, 1, 40, 12, 12).half())
+
+    key, wider = torch.zeros(1, 3, 8), replace(batch, state=state + (torch.arange(22) == 14))
+    ends_by = network.condition(batch, key)[0] != network.condition(wider, key)[0]
+    assert torch.equal(read_by_end(network)[:20], ends_by[:20])  # of what is not the key pose
 
     def plan(width: float | None) -> torch.Tensor:
         generator = torch.Generator().manual_seed(0)

@@ -95,9 +95,8 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
 
 def test_accelerate_moves_observations_to_a_device() -> None:
     batch, _ = toy_dataset(TOY).take(torch.tensor([0, 3]))
-    meta = torch.device("meta")
-    moved, _ = send_to_device((batch, None), meta)
-    assert moved.touch.device == moved.state.device == meta and moved.images is None
+    moved, _ = send_to_device((batch, None), torch.device("meta"))
+    assert moved.touch.is_meta and moved.state.is_meta and moved.images is None
 
 
 @pytest.mark.parametrize(

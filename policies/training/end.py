@@ -38,7 +38,7 @@ def fit_end(
         end = EndOutput(condition.shape[1]).requires_grad_(True)
     end.mean.copy_(condition.mean(0))
     end.scale.copy_(condition.std(0).clamp(min=_LEAST_SPREAD if policy.key_pose else 1e-6))
-    end.scale[~_read_by_end(policy)] = torch.inf
+    end.scale[~read_by_end(policy)] = torch.inf
     inputs, generator = end.scaled(condition), torch.Generator().manual_seed(seed)
     optimiser = torch.optim.AdamW(end.parameters(), _RATE, weight_decay=_DECAY)
     for _ in range(min(_STEPS, _PASSES * -(-len(inputs) // _BATCH))):
@@ -54,7 +54,7 @@ def fit_end(
     return ended
 
 
-def _read_by_end(policy: PolicyNetwork) -> Bool[Tensor, " c"]:
+def read_by_end(policy: PolicyNetwork) -> Bool[Tensor, " c"]:
     """Return which of the head's inputs the end output reads: with cameras the gripper's width and the key pose.
 
     It would else learn the turns and tilts of the hand at the few ends that it is shown.
