@@ -53,9 +53,7 @@ class PolicyConfig:
     # m, the only two widths that the demonstrations command. A predicted width becomes the nearest of
     # them, because the hand would stop at one in between. Empty: any width
     gripper_widths: tuple[float, ...] = ()
-    gripper_changes: int = (
-        0  # fewest between these in a demonstration: before so many it is not done
-    )
+    gripper_changes: int = 0  # fewest in a demonstration; with fewer the task is not done
     end_to_end: EndToEndConfig | None = None  # touch encoder that is trained jointly; None without
     images: ImageInputConfig | None = None  # cameras, by a frozen image encoder; None without
     # columns of `features.FEATURES`, the state first. Columns of ground truth come from a state

@@ -7,9 +7,7 @@ from torch import Tensor, nn
 from touchgoal.policies.heads.mlp import readout
 
 END_SECONDS = 0.5  # s at the end of a successful recording in which the task is done
-LEAVING_SECONDS = (
-    1.5  # s, the same where a hand is seen to leave what it let go: it slows down where it stops
-)
+LEAVING_SECONDS = 1.5  # s, the same by sight: a hand that leaves slows down where it stops
 # s for which its probability must last in recordings, which stop soon after the end; for a policy this is
 # enough where they go on after success. Elsewhere an object that hovers over its place looks nearly done.
 LASTING, _DONE_SECONDS = 0.3, 0.8

@@ -14,9 +14,7 @@ from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 _STEPS, _PASSES, _BATCH = 1500, 100, 512  # steps and passes over the data at most
 _RATE, _DECAY, _NOISE = 1e-3, 1e-2, 0.1
-_LEAST_SPREAD = (
-    0.05  # of an input by sight: less is divided by this, since few recordings show its variation
-)
+_LEAST_SPREAD = 0.05  # of an input by sight, to divide by: few recordings show too little of it
 _ROWS = 1024  # windows that are encoded at once
 _EARLY = 0.5  # s before the end of a recording begins at which it is not done
 _LEAST_LIMIT = 0.5
