@@ -53,7 +53,7 @@ class PolicyConfig:
     # m, the only two widths that the demonstrations command. A predicted width becomes the nearest of
     # them, because the hand would stop at one in between. Empty: any width
     gripper_widths: tuple[float, ...] = ()
-    gripper_changes: int = 0  # fewest in a demonstration; with fewer the task is not done
+    gripper_changes: int = 0  # fewest in a demonstration with cameras; after fewer it is not done
     end_to_end: EndToEndConfig | None = None  # touch encoder that is trained jointly; None without
     images: ImageInputConfig | None = None  # cameras, by a frozen image encoder; None without
     # columns of `features.FEATURES`, the state first. Columns of ground truth come from a state
@@ -209,7 +209,7 @@ class PolicyNetwork(nn.Module):
 
     def forward(
         self,
-        batch: ObservationBatch,
+        observed: ObservationBatch,
         actions: Float[Tensor, "b h 8"],
         noise: BatchNoise,
         action_is_pad: Bool[Tensor, "b h"],
@@ -222,19 +222,20 @@ class PolicyNetwork(nn.Module):
         pose, key_pose_loss = None, torch.zeros((), device=actions.device)
         if self.key_pose:
             assert key_pose is not None, "needs key poses"
-            maps, hand = self.seen(batch)
+            maps, hand = self.seen(observed)
             key_pose_loss = self.key_pose.loss(maps, hand, key_pose[:, 1:])
             pose = kp.true_pose(hand[:, :7], key_pose)
             draws = 1 if self.end_to_end_encoder else _DRAWS
-            rows = batch.touch, batch.state, batch.images, pose, actions, action_is_pad
+            seen = observed.touch, observed.state, observed.images
+            rows = *seen, pose, actions, action_is_pad
             again: list[Any] = [None if x is None else x.repeat_interleave(draws, 0) for x in rows]
             touch, state, images, pose, actions, action_is_pad = again
-            batch = ObservationBatch(touch, state, images)
-        chunk = to_representation(actions, batch.joints, self.config.representation)
+            observed = ObservationBatch(touch, state, images)
+        chunk = to_representation(actions, observed.joints, self.config.representation)
         if pose is not None and self.config.representation == "body_twist":
             pose, chunk = kp.face_any_way(pose, chunk, noise)
             pose, chunk = kp.set_beside(pose, chunk, noise)
-        encoded = self._encode(batch, pose, noise)
+        encoded = self._encode(observed, pose, noise)
         loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
         return {"loss": loss + key_pose_loss}
 

@@ -135,7 +135,7 @@ def test_an_error_of_the_controller_is_said_and_kept_until_recovered(twin: Twin,
     twin.at_rest()
     with pytest.raises(DriverError, match=words):
         arm.command(arm.read().q)
-    until(lambda: not recover(twin, arm))  # a UR lets nobody unlock it for 5 s
+    until(lambda: not recover(twin, arm))  # a UR5e is locked for the first 5 s
     follows_again(twin)
 
 

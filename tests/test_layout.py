@@ -17,8 +17,8 @@ from touchgoal.launch.__main__ import COMMANDS
 
 # Ceilings fall with every change that removes, and rise only by the budget that an issue names,
 # in a change that says so.
-WHEEL_LINES = 50_700  # of Python
-REPOSITORY_LINES = 64_670  # of Python, with benchmarks, plugins and docs
+WHEEL_LINES = 50_714  # of Python
+REPOSITORY_LINES = 64_684  # of Python, with benchmarks, plugins and docs
 TEST_LINES = 20_327  # of Python
 PAGE_WORDS = 12_000  # README, CHANGELOG and docs/*.md
 COMMANDS_IN_ALL = 35  # sub-commands included

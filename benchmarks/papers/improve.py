@@ -133,7 +133,7 @@ class _Lab:
         return {i: JudgedOutcome("success" if t else "failure") for i, t in enumerate(true)}
 
     def overrule(self, name: Filter, data: Path) -> None:
-        """Write what a filter says over the verdicts of the judge, which has told its own as it ended the runs."""
+        """Replace the judge's verdicts, which runs carry since the judge ends them, by those of the filter."""
         if name != "judge":
             episodes = EpisodeSet(self.out / name / "episodes")
             write_judged(episodes, self.label(name, data, episodes))

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 from torch import Tensor
 
 from touchgoal.encoders.training.batch_noise import BatchNoise
@@ -51,9 +51,8 @@ def key_poses(
         hold: ticks for which a key pose stays the next one after the change: the change is not visible
             until the fingers have moved.
     """
-    closed = widths < (widths.min() + widths.max()) / 2
+    closed, changes = _closed(widths), gripper_changes(widths)
     ends = np.cumsum(lengths) - 1
-    changes = np.flatnonzero(np.diff(closed)) if np.ptp(widths) > _LEVELS else np.empty(0, int)
     let_go = ~closed[ends] & np.isin(ends, ends[np.searchsorted(ends, changes)])
     keys = np.union1d(changes, ends[~let_go]).astype(np.int64)
     last = ends[np.searchsorted(ends, keys)]
@@ -67,6 +66,17 @@ def key_poses(
     known = before > np.repeat(ends - lengths, lengths)
     left = np.concatenate([tcp[np.where(known, before, tick)], known[:, None]], 1)
     return np.concatenate([left[:, None], poses[np.searchsorted(until, tick)]], 1, dtype=np.float32)
+
+
+def gripper_changes(widths: Float32[np.ndarray, " n"]) -> Int[np.ndarray, " c"]:
+    """Return the ticks after which the gripper opens or closes, by its commanded widths (m)."""
+    return (
+        np.flatnonzero(np.diff(_closed(widths))) if np.ptp(widths) > _LEVELS else np.empty(0, int)
+    )
+
+
+def _closed(widths: Float32[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    return widths < (widths.min() + widths.max()) / 2
 
 
 def true_pose(tcp: Float[Tensor, "b 7"], key: Float[Tensor, "b 3 8"]) -> Float[Tensor, "b 11"]:

@@ -19,7 +19,7 @@ from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.sight.frozen_images import ImageEmbedder
-from touchgoal.policies.sight.key_pose import HOLD_SECONDS, key_poses
+from touchgoal.policies.sight.key_pose import HOLD_SECONDS, gripper_changes, key_poses
 from touchgoal.policies.training.action_meaning import ActionMeaning, joint_changes
 from touchgoal.policies.training.embedding_cache import embed_episodes
 from touchgoal.runtime.errors import UserError
@@ -111,8 +111,8 @@ def _done(
     marks = []
     for i, action in zip(chosen, actions, strict=True):
         meta, n = episodes.meta(i), len(action)
-        moved = np.flatnonzero(np.diff(action[:, -1], prepend=np.nan))[-1]
-        ticks = max(ends, min(leaving, n - moved)) if config.images else ends
+        last = max(gripper_changes(action[:, -1]), default=-1) if config.images else n
+        ticks = max(ends, min(leaving, n - 1 - last))
         good = meta.get("outcome") != CORRECTED or bool(meta.get("success"))
         marks.append((torch.arange(n) >= n - ticks) & good)
     return torch.cat(marks)

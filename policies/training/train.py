@@ -19,6 +19,7 @@ from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, 
 from touchgoal.policies import checkpoint
 from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.network import PolicyConfig, PolicyNetwork
+from touchgoal.policies.sight.key_pose import gripper_changes
 from touchgoal.policies.training.end import fit_end
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
@@ -61,7 +62,7 @@ def train(
             folders.append(out_dir / SNAPSHOTS / f"epoch-{len(history):04d}")
         if folders and averaged.key_pose:
             batch = _validation_batch(averaged, validation)
-            averaged.key_pose.calibrate(*averaged.seen(batch["batch"]), batch["key_pose"][:, 1:])
+            averaged.key_pose.calibrate(*averaged.seen(batch["observed"]), batch["key_pose"][:, 1:])
         if folders and averaged.end:  # how many validation episodes it ends, of how many
             known["ended"] = fit_end(averaged, windows, validation, options.seed)
         for folder in folders:
@@ -100,8 +101,10 @@ def untrained(policy: PolicyConfig, windows: SequenceDataset, seed: int) -> Poli
     recorded = windows.recorded
     widths = recorded.actions[:, -1]
     if len(levels := widths.unique().tolist()) == 2:
-        changes = min(int(w.diff().count_nonzero()) for w in widths.split(list(recorded.lengths)))
-        policy = replace(policy, gripper_widths=tuple(levels), gripper_changes=changes)
+        policy = replace(policy, gripper_widths=tuple(levels))
+    if recorded.key_pose is not None:
+        each = widths.split(list(recorded.lengths))
+        policy = replace(policy, gripper_changes=min(len(gripper_changes(w.numpy())) for w in each))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = PolicyNetwork(policy)
@@ -128,7 +131,7 @@ def make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, A
     """Return some windows as a `PolicyNetwork` takes them in training, but for the noise."""
     observed, actions = windows.take(rows)
     return {
-        "batch": observed,
+        "observed": observed,
         "actions": actions,
         "action_is_pad": windows.action_is_pad[rows],
         "key_pose": windows.key_pose(rows),
@@ -148,7 +151,7 @@ def _validate(policy: PolicyNetwork, windows: SequenceDataset, seed: int) -> dic
     """Return the loss, the error of the joint change (rad) planned over the chunk, and of key poses (m)."""
     batch = _validation_batch(policy, windows)
     generator = torch.Generator().manual_seed(seed)
-    observed = batch["batch"]
+    observed = batch["observed"]
     planned = policy.plan(observed, generator, key_pose=batch["key_pose"]).actions
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
